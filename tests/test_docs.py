@@ -1,5 +1,6 @@
 """Test the documents: commands, configurations, programs, links, generated tables."""
 
+import configparser
 import os
 import re
 import shlex
@@ -7,7 +8,9 @@ import shutil
 import subprocess
 import sys
 import textwrap
-from collections.abc import Iterator
+import tomllib
+from collections.abc import Iterator, Sequence
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
@@ -16,17 +19,71 @@ import pytest
 
 from docs.generate import pictures, references
 from imud import config
-from imud.cli import COMMANDS, build_parser
+from imud.cli import COMMANDS, build_parser, main
 from imud.drivers import DRIVERS
 from imud.model.sample import Sample
-from tests.support.daemon_process import LIMIT_S, sending_daemon
+from tests.support.daemon_process import LIMIT_S, daemon_with_module, sending_daemon
 from tests.support.files import ROOT, hi91
 
 FIRST_PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md")]
 PAGES = [*FIRST_PAGES, *sorted((ROOT / "docs").glob("*.md"))]
-FENCE = re.compile(r"^ *```(\w+)\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
+FENCE = re.compile(r"^ *```(\w*)\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)")
 ANCHOR_LINK = re.compile(r"\]\(([^)#:]*)#([^)]+)\)")
+
+
+SEPARATORS = ("|", "&&", "||", ";", "&")
+
+HOST = "changes or reads the host with root, systemd or hardware; the lab of Debian tests such steps"
+NETWORK = "needs a package index, a broker, a database or another host"
+NOT_RUN = {
+    **dict.fromkeys(("apt", "apt-get", "dpkg-query", "usermod", "systemctl", "systemd-sysusers", "udevadm"), HOST),
+    **dict.fromkeys(("journalctl", "systemd-analyze", "sudoedit", "nano", "modprobe", "ip", "stty", "candump"), HOST),
+    **dict.fromkeys(("gpspipe", "timeout"), HOST),
+    **dict.fromkeys(("pipx", "curl", "ssh", "nc", "socat", "mosquitto_passwd", "ros2"), NETWORK),
+    **dict.fromkeys((".", "export", "echo", "printf", "base64", "openssl", "grep"), "a tool of the shell"),
+    **dict.fromkeys(("cp", "rm", "ln", "install", "tar"), "a tool of the shell; `bash -n` checks its syntax"),
+    "cc": "test_examples_read_from_a_running_daemon",
+    "./reader": "test_examples_read_from_a_running_daemon",
+    "promtool": "tests/monitoring/test_rules.py", "amtool": "tests/monitoring/test_rules.py",
+}  # fmt: skip
+"""Programs of shell examples that no test of this module starts or parses, with the reason or the test."""
+
+CHECKED_HERE = ("sh", "yaml", "console", "ini", "c", "text", "python README.md", "python reader.md")
+"""Languages, or languages and pages, that this module or `test_example_package.py` (drivers.md) checks.
+
+`text` is output, or a file of another program.
+"""
+
+TESTED_ELSEWHERE = {
+    "yaml prometheus.yml": "tests/monitoring/test_rules.py",
+    "yaml imud-targets.yml": "tests/monitoring/test_rules.py",
+    "yaml my.rules.yml": "tests/monitoring/test_rules.py",
+    "yaml sheet.yaml": "tests/cli/test_noise.py",
+    "python captures.md": "tests/formats/test_capture.py",
+    "python fleet.md": "tests/fleet/test_reader.py",
+    "python recording.md": "tests/cli/test_record.py",
+    "python socket.md": "tests/publishers/socket/test_documentation.py",
+    "json socket.md": "tests/publishers/socket/test_documentation.py",
+    "json fleet.md": "tests/fleet/test_commands.py",
+    "acl fleet.md": "tests/fleet/test_commands.py",
+    "python drivers.md": "tests/test_example_package.py",
+    "toml drivers.md": "tests/test_example_package.py",
+}
+"""Examples by language and page, or by language and file name, with the module that tests them."""
+
+TASK_PAGES = (
+    "first-sensor.md", "reader.md", "lost-samples.md", "time-stamp-error.md", "replace.md", "mounting.md", "week.md",
+    "tilt.md", "gnss.md", "problem.md", "ros2.md",
+)  # fmt: skip
+"""Pages whose commands run on a daemon with a simulated device, from top to bottom."""
+
+INSTEAD = {
+    "run": "the daemon runs already",
+    "probe": "the daemon uses the port",
+    "fleet": "tests/cli/test_fleet.py, with a broker",
+}
+"""Commands of the task pages that do not run on the daemon of the test, with the reason."""
 
 
 class Example(NamedTuple):
@@ -47,13 +104,24 @@ def without_packages(found: list[Example]) -> list[Example]:
     return [example for example in found if example.page.name != "drivers.md"]
 
 
+def shell_commands() -> Iterator[tuple[str, list[str]]]:
+    """Yield page and words of each command in the shell examples, without `sudo`, variables and redirections."""
+    for page, language, text in without_packages(examples("sh", "console")):
+        lines = text.replace("\\\n", " ").splitlines()
+        for line in (line.removeprefix("$ ") for line in lines if language == "sh" or line.startswith("$ ")):
+            tokens = shlex.shlex(line, posix=True, punctuation_chars=True)
+            tokens.whitespace_split = True
+            for is_end, group in groupby(tokens, lambda token: token in SEPARATORS):
+                words = list(group)
+                while words[0] == "sudo" or re.match(r"[A-Z_]+=", words[0]):
+                    del words[0]
+                if not is_end:
+                    yield page.name, words[: next((n for n, word in enumerate(words) if word in {">", ">>"}), None)]
+
+
 def imud_lines() -> Iterator[list[str]]:
-    """Yield the words of each `imud …` command line in the shell examples, without comments and redirection."""
-    for example in without_packages(examples("sh")):
-        for line in example.text.replace("\\\n", " ").splitlines():
-            words = shlex.split(line, comments=True)
-            if words[:1] == ["imud"]:
-                yield words[1 : words.index(">")] if ">" in words else words[1:]
+    """Yield the arguments of each `imud …` command in the shell examples."""
+    return (words[1:] for _, words in shell_commands() if words[0] == "imud")
 
 
 def test_links_and_their_anchors_lead_somewhere() -> None:
@@ -91,6 +159,106 @@ def test_configurations_are_good() -> None:
     for example in without_packages(examples("yaml")):
         if not example.text.startswith("# "):
             config.parse(example.text, f"{example.page.name}:{example.text.splitlines()[0]}")
+
+
+def test_each_example_is_checked_or_has_a_reason() -> None:
+    unchecked = set[str]()
+    for page, language, text in examples(*{match[1] for file in PAGES for match in FENCE.finditer(file.read_text())}):
+        title = re.match(r"# ([\w.-]+)", text) if language == "yaml" else None
+        key = f"{language} {title[1] if title else page.name}"
+        if key not in CHECKED_HERE and (title or language not in CHECKED_HERE):
+            unchecked |= {key} - TESTED_ELSEWHERE.keys()
+    assert not unchecked, "expected a test, or a row of TESTED_ELSEWHERE"
+    for key, module in TESTED_ELSEWHERE.items():
+        name = key.split()[1] if key.endswith(".md") else ""
+        assert name in (ROOT / module).read_text(), f"{module} does not read {name}"
+    shown = {example.text for example in examples("text")}
+    assert not [text for text in shown if re.search(r"^(sudo|imud \w+ (?!\w+:))", text, re.MULTILINE)], "use sh"
+
+
+def test_shell_examples_have_valid_syntax_known_programs_files_and_targets(tmp_path: Path) -> None:
+    (tmp_path / "all.sh").write_text("".join(example.text for example in examples("sh")))
+    subprocess.run(["bash", "-n", str(tmp_path / "all.sh")], check=True, timeout=LIMIT_S)
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    for name, words in shell_commands():
+        program = Path(words[0]).name if words[0].endswith(("pip", "python3", "imud")) else words[0]
+        if program == "make":
+            assert [word for word in words[1:] if "=" not in word and word not in targets] == [], name
+        elif program in {"pip", "pipx"}:
+            asked = {name for word in words for found in re.findall(r"\[([\w,]+)\]", word) for name in found.split(",")}
+            assert asked <= extras.keys(), name
+        elif program == "python3":
+            code = words[words.index("-c") + 1] if "-c" in words else ""
+            compile(code, name, "exec")
+        else:
+            assert program == "imud" or program in NOT_RUN, f"{name}: expected a test of {words}, or a row of NOT_RUN"
+        folders = ("etc/", "systemd/", "imud/", "docs/", "tests/")
+        assert [word for word in words if word.startswith(folders) and not (ROOT / word).exists()] == [], name
+
+
+def test_units_have_sections_and_directives() -> None:
+    for page, _, text in examples("ini"):
+        unit = configparser.ConfigParser(delimiters="=", interpolation=None)
+        unit.read_string(text)
+        assert [name for name in unit.sections() if not unit[name]] == [], page.name
+
+
+def runnable(words: Sequence[str], folder: Path, duration: str) -> list[str]:
+    """Return a command of a task page with the port, the files and the duration of the test."""
+    places = {"/etc/imud.yaml": str(folder / "imud.yaml"), "bow.yaml": str(folder / "imud.yaml")}
+    short = [duration if before == "--duration" else
+             "sample.imudrec" if re.fullmatch(r"\d+T\d+Z-\S+\.imudrec", word) else
+             str(folder / "port") if word.startswith("/dev/") else places.get(word, word)
+             for before, word in pairwise(["", *words])]  # fmt: skip
+    if "--follow" in short:
+        short[short.index("--follow") :] = ["--count", "1"] if short[0] == "watch" else ["--since", "1h"]
+    return short + (["--yes"] if "--restore" in short else [])
+
+
+@pytest.mark.live
+def test_commands_of_task_pages_run_on_a_daemon(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("IMUD_SOCKET", str(tmp_path / "imud.sock"))
+    with daemon_with_module(tmp_path):
+        for page in TASK_PAGES:
+            for duration in ("0.3", "3", "30"):  # a slow host may send no sample in a short time
+                (tmp_path / f"{page}-{duration}").mkdir()
+                monkeypatch.chdir(tmp_path / f"{page}-{duration}")
+                failed = []
+                for words in [words[1:] for name, words in shell_commands() if name == page and words[0] == "imud"]:
+                    if words[0] not in INSTEAD and not succeeds(runnable(words, tmp_path, duration)):
+                        failed.append((words, capsys.readouterr()))
+                if not failed:
+                    break
+            assert not failed, page
+
+
+def succeeds(argv: Sequence[str]) -> bool:
+    """Run a command of imud. `doctor` may find problems of the host of the test."""
+    try:
+        return main(argv) in ({0, 1, 2} if argv[0] == "doctor" else {0})
+    except SystemExit as end:  # --version
+        return end.code == 0
+
+
+@pytest.mark.live
+def test_the_reader_continues_after_a_restart(tmp_path: Path) -> None:
+    (code,) = (example.text for example in examples("python") if example.page.name == "reader.md")
+    places = {"IMUD_SOCKET": str(tmp_path / "imud.sock")}
+    argv = [sys.executable, "-u", "-c", code]
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True, env=os.environ | places) as reader:
+        assert reader.stdout is not None
+        epochs, lines = set[str](), iter(reader.stdout)
+        try:
+            for _ in range(2):
+                with sending_daemon(tmp_path, lambda number: hi91(10 * number)):
+                    epochs.add(next(line for line in lines if line.startswith("connected, epoch")))
+                    assert "9.8" in next(lines)
+        finally:
+            reader.kill()
+    assert len(epochs) == 2
 
 
 @pytest.mark.live
@@ -147,8 +315,9 @@ def test_pages_name_every_command_driver_field_and_page() -> None:
     assert [driver for driver in DRIVERS if f"`{driver}`" not in readme] == []
     fields = (ROOT / "docs/sample.md").read_text()
     assert [field for field in Sample.__struct_fields__ if f"`{field}`" not in fields] == []
-    linked = set(LINK.findall((ROOT / "docs/index.md").read_text()))
-    assert {page.name for page in (ROOT / "docs").glob("*.md")} - linked == {"index.md"}
+    rows = re.findall(r"^\| \[[\w-]+\]\(([\w-]+\.md)\)", (ROOT / "docs/index.md").read_text(), re.MULTILINE)
+    assert {page.name for page in (ROOT / "docs").glob("*.md")} - {*rows} == {"index.md"}
+    assert [name for name in {*rows} if rows.count(name) > 1] == [], "expected each page in one group"
     makefile = (ROOT / "Makefile").read_text()
     for target in re.findall(r"^make (\w+)", readme, re.MULTILINE):
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), target

@@ -2,6 +2,7 @@
 
 import re
 import subprocess
+import textwrap
 from collections import defaultdict
 from pathlib import Path
 
@@ -79,6 +80,7 @@ def test_shortened_rules_differ_in_times_only() -> None:
 # --- the examples of the page --------------------------------------------------------------------------------
 
 PAGE = (ROOT / "docs/monitoring.md").read_text()
+ALERTS_PAGE = ROOT / "docs/alerts.md"
 EXAMPLES = dict(re.findall(r"^```yaml\n# ([\w.-]+\.yml)[^\n]*\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL))
 
 
@@ -93,5 +95,8 @@ def test_prometheus_accepts_rules_tests_of_alerts_configuration_and_examples(tmp
     (tmp_path / RULES.name).write_text(RULES.read_text())
     run("promtool", "check", "config", str(tmp_path / "prometheus.yml"))
     run("promtool", "check", "rules", str(tmp_path / "my.rules.yml"))
+    (text,) = re.findall(r"```yaml\n( *# prometheus.yml\n.*?)^ *```", ALERTS_PAGE.read_text(), re.MULTILINE | re.DOTALL)
+    (tmp_path / "prometheus.yml").write_text(textwrap.dedent(text))
+    run("promtool", "check", "config", str(tmp_path / "prometheus.yml"))
     for name in ("prometheus.yml", "imud-targets.yml"):
         assert yaml.safe_load(EXAMPLES[name]) == yaml.safe_load((FOLDER / name).read_text())
