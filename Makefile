@@ -152,7 +152,6 @@ pictures: $(VENV)/made
 	$(BIN)/python -m docs.generate.pictures
 	$(BIN)/python -m docs.generate.terminal_pictures
 	$(BIN)/python -m docs.generate.analysis_pictures
-	$(BIN)/python -m docs.generate.clock_pictures
 
 # Coverage-guided fuzzing: ARGS="--seconds 60 --seed 25" in CI, ARGS="--seconds 3600 --target stream/" by hand.
 $(VENV)/made-fuzz: $(VENV)/made

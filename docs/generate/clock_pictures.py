@@ -1,16 +1,17 @@
-"""Draws both plots of docs/measurements.md from `clock_figures.json`: `python -m docs.generate.clock_pictures`."""
+"""Draws both plots of docs/measurements/timestamps.md: `make report` calls `draw`."""
 
 from collections.abc import Sequence
 from typing import Final
 
+import msgspec
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from imud.cli.noise import picture
-from tests.bench.clock_figures import ArrivalFigures, LineFigures, kept
-from tests.support.files import ROOT
+from tests.bench.clock_figures import ArrivalFigures, LineFigures
+from tests.support.results import ROOT, Results
 
 FOLDER: Final = ROOT / "docs/pictures"
 RATE_COLOURS: Final = {1: "#8e44ad", 100: "#1f5fa8", 200: "#2e8b57", 400: "#d68910", 1000: "#c0392b"}
@@ -78,6 +79,9 @@ def _finish(axes: Axes) -> None:
     axes.tick_params(which="both", labelsize=7.5)
 
 
-if __name__ == "__main__":
-    (FOLDER / "clock_arrivals.svg").write_bytes(picture(arrivals_figure(kept().arrivals), ".svg"))
-    (FOLDER / "clock_lines.svg").write_bytes(picture(lines_figure(kept().lines), ".svg"))
+def draw(arrivals: Results, lines: Results) -> None:
+    """Draw the results of `tests.bench.clock` and `tests.bench.clock_lines`."""
+    found = msgspec.convert(arrivals.tables[0].rows, list[ArrivalFigures])
+    (FOLDER / "clock_arrivals.svg").write_bytes(picture(arrivals_figure(found), ".svg"))
+    rows = msgspec.convert(lines.tables[0].rows, list[LineFigures])
+    (FOLDER / "clock_lines.svg").write_bytes(picture(lines_figure(rows), ".svg"))

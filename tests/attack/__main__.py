@@ -18,6 +18,7 @@ from typing import Final
 from tests.attack.attacks import ATTACKS, Attack, Done
 from tests.attack.hostile import Deeds
 from tests.attack.stage import CLIENTS, GOOD_UID, HOSTILE_UIDS, LOST_SETTLE_S, PRIORITY, AttackedDaemon, Scheduling
+from tests.support.results import ProgramRun, Row, Table, add_json, printed
 
 P99_LIMIT_MS: Final = 5.0
 """Maximum of the 99th percentile of two delays, ms: replies to the good client, and its samples after their arrival."""
@@ -107,11 +108,6 @@ def _losses(seen: Measured, starves: bool) -> list[str]:
 
 
 SHORT_S, LONG_S = 1.5, 8.0
-HEAD = (
-    f"{'attack':<15}{'clients':>8}{'connects':>9}{'requests':>10}{'MB sent':>8}{'samples':>8}{'lost':>6}{'port':>6}"
-    f"{'ledger':>7}{'p50 ms':>8}{'p99 ms':>8}{'max ms':>8}{'smp p99':>8}{'RSS MB':>8}{'fds':>6}{'left':>5}{'CPU %':>6}"
-    f"{'refused':>8}{'evicted':>8}"
-)
 
 
 @dataclass
@@ -169,19 +165,20 @@ def measure(entry: Attack, stage: AttackedDaemon, seconds: float, idle_mb: float
     return measured, done
 
 
-def row(name: str, seen: Measured) -> str:
-    unknown = f"+{seen.ledger_unknown}?" if seen.ledger_unknown else ""
-    return (
-        f"{name:<15}{seen.deeds.clients:>8}{seen.deeds.connections:>9}{seen.deeds.requests:>10}"
-        f"{seen.deeds.sent_bytes / 1e6:>8.1f}{seen.samples:>8}{seen.lost:>6}{seen.port_refused:>6}"
-        f"{f'{seen.ledger_lost}{unknown}':>7}{seen.reply_p50_ms:>8.2f}{seen.reply_p99_ms:>8.2f}{seen.reply_max_ms:>8.2f}"
-        f"{seen.sample_p99_ms:>8.2f}{seen.above_mb:>8.1f}{seen.fds:>6}{seen.fds_left:>5}{100 * seen.cpu_share:>6.0f}"
-        f"{seen.refused:>8}{seen.evicted:>8}"
-    )
+def row(name: str, seen: Measured) -> Row:
+    return {
+        "attack": name, "clients": seen.deeds.clients, "connections": seen.deeds.connections,
+        "requests": seen.deeds.requests, "sent, MB": seen.deeds.sent_bytes / 1e6, "samples": seen.samples,
+        "lost": seen.lost, "rejected by the port": seen.port_refused, "lost in the ledger": seen.ledger_lost,
+        "gaps of unknown size": seen.ledger_unknown, "reply p50, ms": seen.reply_p50_ms,
+        "reply p99, ms": seen.reply_p99_ms, "reply max, ms": seen.reply_max_ms, "sample p99, ms": seen.sample_p99_ms,
+        "memory above idle, MB": seen.above_mb, "descriptors": seen.fds, "left": seen.fds_left,
+        "share of a core": seen.cpu_share, "refused": seen.refused, "evicted": seen.evicted,
+    }  # fmt: skip
 
 
 def attack(
-    name: str, entry: Attack, stage: AttackedDaemon, seconds: float, idle_mb: float, *, delays: bool
+    name: str, entry: Attack, stage: AttackedDaemon, seconds: float, idle_mb: float, rows: list[Row], *, delays: bool
 ) -> list[str]:
     try:
         seen, done = measure(entry, stage, seconds, idle_mb)
@@ -189,7 +186,8 @@ def attack(
         if stage.alive:
             raise
         return ["the daemon ended"]
-    print(row(name, seen), flush=True)
+    rows.append(row(name, seen))
+    print(printed(rows[-1]), flush=True)
     return done.problems + exceeded(seen, delays=delays)
 
 
@@ -214,16 +212,19 @@ def describe(stage: AttackedDaemon, idle_mb: float, *, delays: bool) -> str:
     )
 
 
-def run(chosen: dict[str, Attack], seconds: float, scheduling: Scheduling, *, short: bool) -> list[str]:
+def run(
+    chosen: dict[str, Attack], seconds: float, scheduling: Scheduling, rows: list[Row], *, short: bool
+) -> list[str]:
+    """Run the attacks, append a row for each attack to `rows`, and return the exceeded limits."""
     problems: list[str] = []
     with AttackedDaemon(60 + 2 * (seconds + 15) * len(chosen), scheduling) as stage:
         idle_mb = stage.rss_mb
-        print(f"{describe(stage, idle_mb, delays=not short)}\n{HEAD}", flush=True)
+        print(f"{describe(stage, idle_mb, delays=not short)}", flush=True)
         for name, entry in chosen.items():
-            found = attack(name, entry, stage, seconds, idle_mb, delays=not short)
+            found = attack(name, entry, stage, seconds, idle_mb, rows, delays=not short)
             if found and short and stage.alive:
                 print(f"{name}: {'; '.join(found)}; repeating, because the host may have stalled", flush=True)
-                found = attack(name, entry, stage, seconds, idle_mb, delays=not short)
+                found = attack(name, entry, stage, seconds, idle_mb, rows, delays=not short)
             problems += [f"{name}: {problem}" for problem in found]
             if not stage.alive:
                 break
@@ -240,7 +241,8 @@ def main() -> int:
         metavar="unit|real-time",
         help="scheduling of the daemon: like the unit, or real-time on a core of its own (default)",
     )  # fmt: skip
-    args = parser.parse_args()
+    add_json(parser)
+    args, program_run, rows = parser.parse_args(), ProgramRun(), list[Row]()
     unknown = [name for name in args.names if name not in ATTACKS]
     if unknown:
         parser.error(f"unknown attack {unknown[0]!r}; expected one of: {', '.join(ATTACKS)}")
@@ -248,7 +250,8 @@ def main() -> int:
     if args.short and not args.names:
         chosen = {name: entry for name, entry in chosen.items() if entry.short}
     seconds = args.seconds or (SHORT_S if args.short else LONG_S)
-    problems = run(chosen, seconds, args.scheduling, short=args.short)
+    problems = run(chosen, seconds, args.scheduling, rows, short=args.short)
+    program_run.save(args.json, [Table("", rows)], problems)
     print(*(problems or ["no limit exceeded"]), sep="\n")
     return 1 if problems else 0
 

@@ -14,24 +14,26 @@ from typing import Final
 
 import msgspec
 
-from tests.bench.rows import Row
+from tests.bench.rows import Row, table
+from tests.support.results import ProgramRun, add_json
 
-PARTS = ("clock_table", "latency", "gpsd")
+PARTS = ("clock_table", "latency", "devices", "gpsd")
 SHORT_LIMIT_S: Final = 300.0  # goal on an idle host
 OUTPUT = Path("build/bench.json")
 
 
-def measure(parts: Iterable[str], quick: bool) -> list[Row]:
-    rows: list[Row] = []
+def measure(parts: Iterable[str], quick: bool) -> dict[str, list[Row]]:
+    """Return the rows of each part."""
+    found: dict[str, list[Row]] = {}
     for part in parts:
         print(f"# {part}", flush=True)
         # the time includes the import of the part
         begun_s = monotonic()
         for row in import_module(f"tests.bench.{part}").rows(quick=quick):
             print(row, flush=True)
-            rows.append(row)
+            found.setdefault(part, []).append(row)
         print(f"# {part} took {monotonic() - begun_s:.0f} s", flush=True)
-    return rows
+    return found
 
 
 def main() -> int:
@@ -40,15 +42,18 @@ def main() -> int:
     parser.add_argument(
         "--short", "--quick", action="store_true", help="use shorter runs; the figures are less precise"
     )
+    add_json(parser)
     args = parser.parse_args()
-    begun_s = monotonic()
-    rows = measure(args.parts or PARTS, args.short)
+    begun_s, program_run = monotonic(), ProgramRun()
+    found = measure(args.parts or PARTS, args.short)
+    rows = [row for part in found.values() for row in part]
     took_s = monotonic() - begun_s
+    missed = [f"{row.name}: {row.value:.3g} {row.unit}, goal {row.reach}" for row in rows if row.reached is False]
+    program_run.save(args.json, (table(part, one) for part, one in found.items()), missed)
     OUTPUT.parent.mkdir(exist_ok=True)
     # compare.py reads this file and matches rows by name
     OUTPUT.write_bytes(msgspec.json.format(msgspec.json.encode([row._asdict() for row in rows])))
-    missed = sum(row.reached is False for row in rows)
-    print(f"# {len(rows)} figures in {OUTPUT}, {missed} goals not reached; {took_s:.0f} s")
+    print(f"# {len(rows)} figures in {OUTPUT}, {len(missed)} goals not reached; {took_s:.0f} s")
     if args.short and took_s > SHORT_LIMIT_S:
         print(f"# expected at most {SHORT_LIMIT_S:.0f} s for the short form; is the host busy with other programs?")
     return 0

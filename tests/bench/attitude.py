@@ -5,13 +5,15 @@ assumed figures: gyro 0.005 (°/s)/√Hz with a bias of 0.2 °/s, accelerometer 
 the time per sample does. If imufusion is installed, the command measures it too.
 """
 
+import argparse
 import csv
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from importlib.metadata import version
 from math import acos, atan2, cos, degrees, pi, radians, sin, sqrt
 from pathlib import Path
 from random import Random
-from time import perf_counter
+from time import process_time
 from typing import Final, NamedTuple
 
 from imud.attitude.conventions import FLU_LEVEL, RFU_ENU
@@ -19,6 +21,7 @@ from imud.attitude.rotation import matrix_from_quat, matrix_times, quat_from_eul
 from imud.model.sample import Quaternion, Sample, Sync, Vector3
 from imud.model.units import NS_PER_S, STANDARD_GRAVITY_M_S2
 from imud.sampling.attitude import HostAttitude
+from tests.support.results import ProgramRun, Row, Table, add_json, printed
 
 REST_S: Final = 20
 TURN_S: Final = 10
@@ -36,6 +39,11 @@ MOTIONS: Final[Mapping[str, tuple[Vector3, float, float]]] = {
 VENDOR_FILE: Final = Path(
     os.environ.get("IMUD_VENDOR_RECORDING", Path(__file__).parents[3] / "shared/data/hi91-static-100hz.csv")
 )
+
+COLUMNS: Final = (
+    "at rest: roll and pitch, °", "yaw in 10 s at rest, °", "after the rotation: roll and pitch, °",
+    "yaw after the rotation, °",
+)  # fmt: skip
 
 Motion = list[tuple[Sample, Quaternion]]  # samples and their true attitude
 Filter = Callable[[Sequence[Sample]], list[Quaternion]]
@@ -168,9 +176,8 @@ def _wrapped(angle_deg: float) -> float:
     return (angle_deg + 180) % 360 - 180
 
 
-def main() -> None:
+def table() -> Iterator[Row]:
     filters: dict[str, Filter] = {"vqf": of_imud, "imufusion": of_imufusion}
-    print("filter      rate   rest: tilt, yaw in 10 s   after 10 s at 200 °/s: tilt, yaw   per sample")
     for name, of in filters.items():
         for rate_hz in (100, 200, 1000):
             try:
@@ -179,23 +186,35 @@ def main() -> None:
                 print(f"{name}: {error}")
                 break
             samples = [one for one, _ in motion_of("tilted, about z", rate_hz)]
-            begun_s = perf_counter()
+            begun_s = process_time()
             of(samples)
-            us = (perf_counter() - begun_s) / len(samples) * 1e6
-            rest, turn = (
-                f"{worst.rest_tilt_deg:.3f}° {worst.rest_yaw_deg:.3f}°",
-                (f"{worst.turn_tilt_deg:.3f}° {worst.turn_yaw_deg:.3f}°"),
-            )
-            print(f"{name:10} {rate_hz:5}   {rest:23}   {turn:34}  {us:.1f} µs")
+            us = (process_time() - begun_s) / len(samples) * 1e6
+            filter_name = f"{name} {version(name)}"
+            yield {
+                "filter": filter_name,
+                "rate, Hz": rate_hz,
+                **dict(zip(COLUMNS, worst, strict=True)),
+                "CPU time, µs": us,
+            }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m tests.bench.attitude")
+    add_json(parser)
+    args, program_run, rows = parser.parse_args(), ProgramRun(), list[Row]()
+    for row in table():
+        rows.append(row)
+        print(printed(row), flush=True)
+    tables = [Table("Errors in simulated motion", rows)]
     if not VENDOR_FILE.is_file():
         print(f"no comparison with a device: expected {VENDOR_FILE}, or its path in IMUD_VENDOR_RECORDING")
-        return
-    with VENDOR_FILE.open() as file:
-        found = against_device(list(csv.DictReader(file)))
-    print(
-        f"difference of roll and pitch to a HI91: at rest {found.rest_tilt_deg:.2f}°, in motion (rms) "
-        f"{found.motion_tilt_deg:.2f}°, 2 s after the motion {found.end_tilt_deg:.2f}°"
-    )
+    else:
+        with VENDOR_FILE.open() as file:
+            found = against_device(list(csv.DictReader(file)))
+        row = dict(zip(("at rest, °", "in motion (rms), °", "2 s after the motion, °"), found, strict=True))
+        tables.append(Table("Difference of roll and pitch to the own attitude of a HI91 device, moved by hand", [row]))
+        print(printed(row))
+    program_run.save(args.json, tables)
 
 
 if __name__ == "__main__":

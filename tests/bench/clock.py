@@ -2,10 +2,10 @@
 
 The simulation knows the true time of each sample. A row is a combination of an arrival profile, a rate and a crystal.
 Its figures are from all seeds, after the fit has settled for 70 s. `clock_lines` prints the second table, for lines and
-UTC. `--quick` uses one seed and fewer rows. `--keep` stores the figures for docs/measurements.md.
+UTC. `--short` uses one seed and fewer rates.
 """
 
-import sys
+import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import sqrt
@@ -15,7 +15,8 @@ from imud.model.sample import Measurement, Sync
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sampling.clock import SampleClock
 from imud.sim.ports.arrival import PROFILES, ArrivalModel, ArrivalProfile, Crystal
-from tests.bench.clock_figures import ARRIVAL_HEAD, ArrivalFigures, Spread, keep
+from tests.bench.clock_figures import ArrivalFigures, Spread
+from tests.support.results import ProgramRun, Table, add_json, printed, rows_of
 
 TICK_NS = NS_PER_MS  # HI91 has a device time in ms
 TICK_MODULUS = 1 << 32  # u32, wraps after 49.7 days
@@ -105,7 +106,7 @@ def _spread_us(values: Sequence[float]) -> Spread:
 
 
 def table(seeds: Sequence[int], rates: Sequence[int]) -> Iterator[ArrivalFigures]:
-    """Yield the rows of the table in docs/measurements.md. Each value is a range from the best to the worst crystal."""
+    """Yield the rows of the table. Each value is a range from the best to the worst crystal."""
     for profile in PROFILES:
         for rate_hz in rates:
             all_of = [over_seeds(profile, rate_hz, crystal, seeds) for crystal in CRYSTALS.values()]
@@ -116,14 +117,14 @@ def table(seeds: Sequence[int], rates: Sequence[int]) -> Iterator[ArrivalFigures
 
 
 def main() -> None:
-    quick = "--quick" in sys.argv
-    print(ARRIVAL_HEAD)
-    found = []
-    for one in table((1,), (1, 100, 1000)) if quick else table((1, 2, 3), tuple(SECONDS)):
-        found.append(one)
-        print(one.row(), flush=True)
-    if "--keep" in sys.argv and not quick:
-        keep(arrivals=found)
+    parser = argparse.ArgumentParser(prog="python -m tests.bench.clock")
+    parser.add_argument("--short", "--quick", action="store_true")
+    add_json(parser)
+    args, program_run, found = parser.parse_args(), ProgramRun(), []
+    for one in table((1,), (1, 100, 1000)) if args.short else table((1, 2, 3), tuple(SECONDS)):
+        found += rows_of([one])
+        print(printed(found[-1]), flush=True)
+    program_run.save(args.json, [Table("", found)])
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""Measures the time stamp errors with GPIO lines and UTC for docs/measurements.md."""
+"""Measures the time stamp errors with GPIO lines and UTC: `python -m tests.bench.clock_lines`."""
 
-import sys
+import argparse
 from collections.abc import Iterator
 from itertools import chain
 from statistics import pstdev
@@ -17,7 +17,7 @@ from imud.sim.ports.arrival import (
     Crystal,
 )
 from tests.bench.clock import BAUD_OF_RATE, CRYSTALS
-from tests.bench.clock_figures import LINE_HEAD, LineFigures, keep
+from tests.bench.clock_figures import LineFigures
 from tests.bench.line_model import LineFaults, restarted, simulate_reads
 from tests.bench.line_runs import (
     DatedSample,
@@ -30,6 +30,7 @@ from tests.bench.line_runs import (
     sout_clock,
     with_sout,
 )  # fmt: skip
+from tests.support.results import ProgramRun, Table, add_json, printed, rows_of
 
 SETTLED_S = 20  # after this time, the clock uses the lines
 FAULTS = {
@@ -92,13 +93,13 @@ def table() -> Iterator[LineFigures]:
 
 
 def main() -> None:
-    print(LINE_HEAD)
-    found = []
+    parser = argparse.ArgumentParser(prog="python -m tests.bench.clock_lines")
+    add_json(parser)
+    args, program_run, found = parser.parse_args(), ProgramRun(), []
     for one in table():
-        found.append(one)
-        print(one.row(), flush=True)
-    if "--keep" in sys.argv:
-        keep(lines=found)
+        found += rows_of([one])
+        print(printed(found[-1]), flush=True)
+    program_run.save(args.json, [Table("", found)])
 
 
 if __name__ == "__main__":

@@ -60,6 +60,7 @@ from tests.bench.adversity import (
 )
 from tests.bench.compare import ROOT, checked_out
 from tests.bench.rows import Row, at_least
+from tests.support.results import ProgramRun, Table, add_json, decode
 
 if TYPE_CHECKING:  # older base commits do not have this module
     from imud.host.clock import SteadyTime
@@ -96,6 +97,10 @@ class CellFigures(msgspec.Struct, frozen=True):
 
 
 Figures = Mapping[str, CellFigures]
+COLUMNS: Final = (
+    "condition, link", "σ, µs", "within 2 t_err before 30 s", "after 30 s", "median t_err / rms error",
+    "rms t_err / rms error",
+)  # fmt: skip
 
 
 class Dated(NamedTuple):
@@ -263,24 +268,30 @@ def kept_base() -> Base:
 
 
 def base_of(commit: str, arguments: Sequence[str]) -> Base:
-    program = [sys.executable, "-P", "-m", "tests.bench.clock_table", "--json", *arguments]
     # imud of the base commit, tests of this tree
     with checked_out(commit) as tree, tempfile.TemporaryDirectory(prefix="imud-clock-table-") as folder:
         (Path(folder) / "imud").symlink_to(tree / "imud")
         (Path(folder) / "tests").symlink_to(ROOT / "tests")
-        done = subprocess.run(
-            program, env={**os.environ, "PYTHONPATH": folder}, cwd=folder, stdout=subprocess.PIPE, check=True
+        file = Path(folder) / "figures.json"
+        program = [sys.executable, "-P", "-m", "tests.bench.clock_table", "--json", str(file), *arguments]
+        subprocess.run(
+            program, env={**os.environ, "PYTHONPATH": folder}, cwd=folder, stdout=subprocess.DEVNULL, check=True
         )
-    return Base(commit, msgspec.json.decode(done.stdout, type=dict[str, CellFigures]))
+        rows = decode(file).tables[0].rows
+    return Base(commit, {name: CellFigures(*figures) for name, *figures in map(dict.values, map(dict, rows))})
+
+
+def row_of(name: str, got: CellFigures) -> Mapping[str, object]:
+    return dict(zip(COLUMNS, (name, *msgspec.structs.astuple(got)), strict=True))
 
 
 def rows(*, quick: bool = False) -> Iterator[Row]:
     for name, got in table(QUICK, "loaded host") if quick else table(range(MACHINES)):
-        yield Row(f"clock table: {name}, sigma", got.sigma_us, "us")
-        yield at_least(f"clock table: {name}, share settled", got.settled, "", SETTLED_LEAST)
-        yield at_least(f"clock table: {name}, share settling", got.settling, "", SETTLING_LEAST)
-        yield Row(f"clock table: {name}, median t_err / rms", got.ratio, "")
-        yield Row(f"clock table: {name}, rms t_err / rms", got.rms_ratio or 0.0, "")
+        yield Row(f"{name}: sigma", got.sigma_us, "µs")
+        yield at_least(f"{name}: share settled", got.settled, "", SETTLED_LEAST)
+        yield at_least(f"{name}: share settling", got.settling, "", SETTLING_LEAST)
+        yield Row(f"{name}: median t_err / rms", got.ratio, "")
+        yield Row(f"{name}: rms t_err / rms", got.rms_ratio or 0.0, "")
 
 
 def show(found: Iterable[tuple[str, CellFigures]], base: Figures) -> int:
@@ -307,14 +318,16 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--only", default="", metavar="TEXT")
     parser.add_argument("--seeds", type=int, default=0, metavar="FIRST")
-    parser.add_argument("--json", action="store_true")
+    add_json(parser)
     parser.add_argument("--base", metavar="COMMIT")
     parser.add_argument("--keep", metavar="COMMIT")
     args = parser.parse_args()
     seeds = [args.seeds + i for i in (QUICK if args.quick else range(MACHINES))]
-    found = table(seeds, args.only)
+    program_run, found = ProgramRun(), table(seeds, args.only)
     if args.json:
-        sys.stdout.buffer.write(msgspec.json.encode(dict(found)))
+        got = dict(found)
+        missed = [f"{name}: {', '.join(words)}" for name, one in got.items() if (words := one.short_of(None))]
+        program_run.save(args.json, [Table("", [row_of(name, one) for name, one in got.items()])], missed)
         return 0
     if args.base or args.keep:
         arguments = ["--only", args.only, "--seeds", str(args.seeds), *(["--quick"] if args.quick else [])]

@@ -23,6 +23,7 @@ from tests.fleet.authority import Authority
 from tests.fleet.gateways import KilledGateway, closes, in_spool
 from tests.fleet.mosquitto import NO_MOSQUITTO, Collector, Mosquitto
 from tests.fleet.proxy import Proxy
+from tests.support.results import ProgramRun, Row, Table, add_json, printed
 from tests.support.surroundings import free_port
 
 CAUGHT_UP: Final = 30
@@ -151,6 +152,11 @@ FAULTS: Final[Mapping[str, tuple[Fault, str]]] = {
 }
 
 
+COLUMNS: Final = (
+    "numbered", "whole", "thinned", "dropped", "waiting", "duplicates", "lost", "spool, bytes", "catch-up, s",
+)  # fmt: skip
+
+
 class Result(NamedTuple):
     numbered: int
     whole: int
@@ -206,28 +212,26 @@ def main() -> int:
     parser.add_argument("faults", nargs="*", choices=[[], *FAULTS], metavar="FAULT", help=", ".join(FAULTS))
     parser.add_argument("--seconds", type=float, default=20.0, help="duration of each fault, s (default: %(default)g)")
     parser.add_argument("--tls", action="store_true", help="use TLS between gateway and broker")
-    args = parser.parse_args()
+    add_json(parser)
+    args, program_run = parser.parse_args(), ProgramRun()
     if NO_MOSQUITTO:
         print(NO_MOSQUITTO)
         return 1
-    failed = False
-    head = "| fault | numbered | whole | thinned | dropped | waiting | duplicate | lost | spool, kB | catching up, s |"
-    print(f"{head}\n{'|---' * 10}|")
+    problems, rows = list[str](), list[Row]()
     for name in args.faults or FAULTS:
         with tempfile.TemporaryDirectory(prefix="imud-faults-") as folder:
             try:
                 one = play(name, Path(folder), args.seconds, tls=args.tls)
             except (AssertionError, TimeoutError) as error:
-                failed = True
-                print(f"| {name} | FAILED: {error} |", flush=True)
+                problems.append(f"{name}: {error}")
+                print(problems[-1], flush=True)
                 continue
-        failed |= not one.closes
-        print(
-            f"| {FAULTS[name][1]} | {one.numbered} | {one.whole} | {one.thinned} | {one.dropped} |"
-            f" {one.waiting} | {one.duplicates} | {one.missing} | {one.high_water / 1000:.0f} | {one.catch_up_s:.1f} |",
-            flush=True,
-        )
-    return int(failed)
+        if not one.closes:
+            problems.append(f"{name}: the ledger does not balance, {one.missing} samples are missing")
+        rows.append({"fault": FAULTS[name][1], **dict(zip(COLUMNS, one, strict=True))})
+        print(printed(rows[-1]), flush=True)
+    program_run.save(args.json, [Table("", rows)], problems)
+    return int(bool(problems))
 
 
 if __name__ == "__main__":

@@ -37,6 +37,7 @@ from tests.fleet.gateways import KilledGateway, in_spool
 from tests.fleet.mosquitto import NO_MOSQUITTO, running_broker
 from tests.fleet.postgres_server import NO_POSTGRES, running_postgres
 from tests.support.daemon_process import wait_until
+from tests.support.results import ProgramRun, Table, add_json
 from tests.support.surroundings import free_port
 
 DEVICES: Final = ("bow", "mast")
@@ -239,7 +240,8 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--postgres", action="store_true", help="let the collector write rows into PostgreSQL")
     parser.add_argument("--cluster", action="store_true", help="use three NATS servers, and kill one of them")
-    args = parser.parse_args()
+    add_json(parser)
+    args, program_run = parser.parse_args(), ProgramRun()
     no_nats = "" if NATS else "cannot find nats-server; try make mqtt-deps"
     if missing := (no_nats if args.cluster else NO_MOSQUITTO) or (NO_POSTGRES if args.postgres else ""):
         print(missing)
@@ -261,8 +263,11 @@ def main() -> int:
             servers, collector, GatewayFleet(args.gateways, servers.ports), args.seconds, outputs
         ):
             print(f"  {row:32} {value:12.2f} {unit}", flush=True)
-            found[row] = value
-    return int(bool(found[LOST] or found[OPEN]))
+            found[row] = value, unit
+    rows = [{"figure": row, "value": value, "unit": unit} for row, (value, unit) in found.items()]
+    problems = [f"{row}: {found[row][0]:g}" for row in (LOST, OPEN) if found[row][0]]
+    program_run.save(args.json, [Table(f"{args.gateways} gateways", rows)], problems)
+    return int(bool(problems))
 
 
 if __name__ == "__main__":

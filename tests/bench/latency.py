@@ -12,22 +12,16 @@ from dataclasses import replace
 from statistics import median
 
 from tests.bench.rig import Load, Outcome, run
-from tests.bench.rows import Row, at_least, at_most
+from tests.bench.rows import Row, at_most
 
 CPU_LIMITS = {1: 1.5, 10: 1.4, 100: 2.0}  # goals: imud / bare loop by number of clients
 P99_LIMIT = 2.0  # goal: p99 of imud / bare loop
 CPU_AIM = 0.35  # goal with a hold: imud / bare loop
 RECORDED_LIMIT = 1.15  # goal: CPU with / without a recording
-RSS_LIMIT_MB = 40.0  # goal with one device
 LATENCY_MS = 10.0
 VARIED = 10  # number of clients with all loads
 # loads with the goal CPU_AIM
 JUDGED = ("latency 10 ms", "at 100 Hz", "at 10 Hz, latency 20 ms")
-FLEETS = (0.0, (1, 4, 16, 32, 48, 64), 32), (LATENCY_MS, (80, 112, 160, 200, 250), 250)
-"""Latency, ms; numbers of devices; goal on one core."""
-APART_FRAMES = 200
-"""Number of frames between the starts of two devices. A clock needs more CPU time until its fit has settled. On a real
-gateway, imud also detects the devices one after another."""
 
 
 def rows(*, quick: bool = False) -> Iterator[Row]:
@@ -35,8 +29,6 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
     for encoding in ("binary", "json"):
         for clients in (1, VARIED) if quick else CPU_LIMITS:
             yield from compare(Load(clients=clients, encoding=encoding, seconds=seconds), rounds)
-    for latency_ms, sizes, aim in FLEETS:
-        yield from growth(seconds, latency_ms, sizes, aim)
 
 
 def loads_of(plain: Load) -> dict[str, Load]:
@@ -61,9 +53,9 @@ def compare(plain: Load, rounds: int) -> Iterator[Row]:
     bare, at_once = found["bare loop"], found["at once"]
     for name, outcomes in found.items():
         words = f"1 kHz, {plain.clients} {plain.encoding} clients, {name}"
-        yield Row(f"{words}: CPU per sample", median(o.cpu_us_per_sample for o in outcomes), "us")
-        yield Row(f"{words}: latency p50", median(o.p50_us for o in outcomes), "us")
-        yield Row(f"{words}: latency p99", median(o.p99_us for o in outcomes), "us")
+        yield Row(f"{words}: CPU per sample", median(o.cpu_us_per_sample for o in outcomes), "µs")
+        yield Row(f"{words}: latency p50", median(o.p50_us for o in outcomes), "µs")
+        yield Row(f"{words}: latency p99", median(o.p99_us for o in outcomes), "µs")
         if not loads[name].bare:
             yield at_most(f"{words}: samples lost", float(max(o.lost for o in outcomes)), "samples", 0)
         ratio, words = ratio_of("cpu_us_per_sample", outcomes, bare), f"{words}: CPU / bare loop"
@@ -76,31 +68,9 @@ def compare(plain: Load, rounds: int) -> Iterator[Row]:
             yield Row(words, ratio, "x")
     if recorded := found.get("at once, recorded"):
         ratio = ratio_of("cpu_us_per_sample", recorded, at_once)
-        yield at_most(f"1 {plain.encoding} client: CPU recorded / not recorded", ratio, "x", RECORDED_LIMIT)
+        words = f"1 kHz, {plain.clients} {plain.encoding} clients, at once, recorded: CPU / not recorded"
+        yield at_most(words, ratio, "x", RECORDED_LIMIT)
 
 
 def ratio_of(figure: str, some: Sequence[Outcome], others: Sequence[Outcome]) -> float:
     return median(float(getattr(a, figure) / getattr(b, figure)) for a, b in zip(some, others, strict=True))
-
-
-def growth(seconds: float, latency_ms: float, sizes: Sequence[int], aim: int) -> Iterator[Row]:
-    """Yield the CPU time by number of devices, and the largest number of devices on one core without lost samples."""
-    most, load = 0, Load(seconds=seconds, phases=4, latency_ms=latency_ms or None)
-    loads = [replace(load, devices=aim, bare=True), *(replace(load, devices=devices) for devices in sizes)]
-    if latency_ms:  # the measurement begins after the start of the last device
-        loads = [replace(one, apart=APART_FRAMES, warm_s=4.0 + one.devices * APART_FRAMES / 1e3) for one in loads]
-    for one in loads:
-        outcome = run(one)
-        words = f"{one.devices} devices at 1 kHz, latency {latency_ms:g} ms{', bare loop' * one.bare}"
-        yield Row(f"{words}: CPU per sample", outcome.cpu_us_per_sample, "us")
-        yield Row(f"{words}: share of one core", outcome.cpu_share, "")
-        if one.bare:
-            continue
-        yield Row(f"{words}: samples lost", float(outcome.lost), "samples")
-        if one.devices == 1:
-            yield at_most(f"{words}: RSS", outcome.rss_mb, "MB", RSS_LIMIT_MB)
-        if outcome.lost:  # more devices would only increase the loss
-            break
-        most = one.devices
-    words = f"devices at 1 kHz on one core, latency {latency_ms:g} ms, without loss"
-    yield at_least(words, float(most), "devices", aim)

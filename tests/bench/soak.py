@@ -42,6 +42,7 @@ from tests.bench.fleet_writer import hi91_frames
 from tests.bench.rig import REST_CORES, SERVER_CORE, START_LIMIT_S, Process, cpu_ns, wait_for
 from tests.bench.soak_recordings import Recordings
 from tests.support.files import CaptureWriter
+from tests.support.results import ProgramRun, Table, add_json
 from tests.support.surroundings import free_port
 
 RATES: Final = ((1.0, 34), (10.0, 22), (20.0, 14), (50.0, 8), (100.0, 3), (400.0, 1))
@@ -275,7 +276,8 @@ def watch_for(watched: Watched, recordings: Recordings, readers: Process, second
     watched.minute(elapsed, elapsed - minute)
 
 
-def run_fleet(seconds: float, metrics_port: int) -> int:
+def run_fleet(seconds: float, metrics_port: int, json_file: Path | None) -> int:
+    program_run = ProgramRun()
     written = written_devices()
     print(
         f"soak: {len(written)} devices behind ptys, {MODULES} Modbus devices on a bus and {REPLAYS} replays, "
@@ -326,6 +328,12 @@ def run_fleet(seconds: float, metrics_port: int) -> int:
     scrapes = f"scrapes {len(watched.points)}, failed requests {watched.unanswered}"
     print(f"frames accepted by ptys {taken}, rejected {refused}; {seen}; {scrapes}; {recorded}; {words}")
     print("\n".join(found or ["passed"]))
+    row = {
+        "devices": len(statuses), "clients": CLIENTS, "duration, s": seconds, "samples": taken,
+        "rejected by ptys": refused, "samples of clients": figures["samples"], "missing at clients": figures["gaps"],
+        "dropped": dropped, "memory": words,
+    }  # fmt: skip
+    program_run.save(json_file, [Table("", [row])], found)
     return 1 if found else 0
 
 
@@ -344,7 +352,9 @@ def wait_open(path: Path, fleet: Fleet) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(prog="make soak")
     parser.add_argument("--seconds", type=float, default=3600.0, help="duration, s")
-    return run_fleet(parser.parse_args().seconds, free_port())
+    add_json(parser)
+    args = parser.parse_args()
+    return run_fleet(args.seconds, free_port(), args.json)
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from typing import Final
 
 from tests.fuzz import c_header
 from tests.fuzz.target import all_names, inputs_of, load, write_all
+from tests.support.results import ProgramRun, Row, Table, add_json
 
 BUILD: Final = Path("build/fuzz")
 SECONDS: Final = 60.0
@@ -51,12 +52,25 @@ class Result:
     findings: tuple[Path, ...]
     failed: bool
 
+    @property
+    def per_s(self) -> float:
+        return self.executions / self.seconds if self.seconds else 0
+
+    @property
+    def outcome(self) -> str:
+        return ", ".join(map(str, self.findings)) or (f"FAILED, see {_log(self.target)}" if self.failed else "none")
+
+    @property
+    def row(self) -> Row:
+        return {
+            "target": self.target, "engine": self.engine, "inputs": self.executions, "inputs per second": self.per_s,
+            "covered edges": self.edges, "findings": self.outcome,
+        }  # fmt: skip
+
     def __str__(self) -> str:
-        per_s = self.executions / self.seconds if self.seconds else 0
-        found = ", ".join(map(str, self.findings)) or (f"FAILED, see {_log(self.target)}" if self.failed else "none")
         return (
-            f"{self.target:24} {self.engine:10} {self.executions:11} {per_s:8.0f} {self.edges:>6} {self.features:>8} "
-            f"{self.inputs:>6}  {found}"
+            f"{self.target:24} {self.engine:10} {self.executions:11} {self.per_s:8.0f} {self.edges:>6} "
+            f"{self.features:>8} {self.inputs:>6}  {self.outcome}"
         )
 
 
@@ -156,7 +170,8 @@ def main() -> int:
     parser.add_argument("--replay", type=Path, metavar="FILE", help="run one input through --target")
     parser.add_argument("--corpus", action="store_true", help="create the corpus in the tree again")
     parser.add_argument("--list", action="store_true", help="print the targets")
-    args = parser.parse_args()
+    add_json(parser)
+    args, program_run = parser.parse_args(), ProgramRun()
     if args.list:
         print("\n".join([*all_names(), c_header.TARGET]))
         return 0
@@ -173,7 +188,9 @@ def main() -> int:
         for each in running:
             results.append(each.result())
             print(results[-1], flush=True)
-    found = sum(result.failed or bool(result.findings) for result in results)
+    problems = [f"{result.target}: {result.outcome}" for result in results if result.failed or result.findings]
+    program_run.save(args.json, [Table("", [result.row for result in results])], problems)
+    found = len(problems)
     total = sum(result.executions for result in results)
     print(f"{len(results)} targets, {total} executions, {found} with findings; logs in {BUILD}")
     return 1 if found else 0

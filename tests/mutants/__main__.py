@@ -18,6 +18,7 @@ from typing import Final
 
 from tests.mutants.changes import Mutant, choose, source_of
 from tests.mutants.trees import USERS, Run, Tree, stages
+from tests.support.results import ProgramRun, Table, add_json
 
 DETECTED, BY_USERS, MISSED, HUNG = "detected", "detected in another folder", "NOT DETECTED", "time-out"
 MEMORY_MAX_BYTES: Final = 6 << 30
@@ -68,7 +69,8 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2, help="number of copies of the tree that run in parallel (2)")
     parser.add_argument("--show", action="store_true", help="print the mutants as diffs and do not run them")
     parser.add_argument("--mutant", type=int, metavar="K", help="run mutant K only and print the output of its tests")
-    options = parser.parse_args()
+    add_json(parser)
+    options, program_run = parser.parse_args(), ProgramRun()
     mutants = dict(enumerate(choose(options.seed, options.count, options.only), 1))
     if options.mutant:
         mutants = {options.mutant: mutants[options.mutant]}
@@ -78,7 +80,7 @@ def main() -> int:
         return 0
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_MAX_BYTES, MEMORY_MAX_BYTES))
     trees: SimpleQueue[Tree] = SimpleQueue()
-    missed = elsewhere = 0
+    missed, elsewhere = list[str](), 0
     with tempfile.TemporaryDirectory(prefix="mutants-", ignore_cleanup_errors=True) as folder:
         Path(folder).chmod(0o755)  # some tests run programs as another user
         for job in range(options.jobs):
@@ -86,14 +88,16 @@ def main() -> int:
         with ThreadPoolExecutor(options.jobs) as pool:
             verdicts = pool.map(partial(judge, trees), mutants.values())
             for number, (result, test, output) in zip(mutants, verdicts, strict=True):
-                missed += result == MISSED
+                missed += [f"not detected: {mutants[number]}"] * (result == MISSED)
                 elsewhere += result == BY_USERS
                 print(f"{number:3}  {mutants[number]}  |  {result}{' by ' if test else ''}{test}", flush=True)
                 if options.mutant:
                     print(output)
-    found = len(mutants) - missed
+    found = len(mutants) - len(missed)
+    row = {"mutants": len(mutants), "detected": found, "of these in another folder": elsewhere}
+    program_run.save(options.json, [Table("", [row])], missed)
     print(f"\n{found} of {len(mutants)} mutants detected, {found / len(mutants):.1%}; {elsewhere} in another folder")
-    return int(missed > 0)
+    return int(bool(missed))
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from typing import Final, NamedTuple
 import msgspec
 
 from tests.bench.instructions.measured import INTERPRETER, MARK, MARKS
+from tests.support.results import ProgramRun, Table, add_json
 
 FILE: Final = Path(__file__).with_name("figures.json")
 GROWTH_MOST: Final = 0.05  # Maximum growth of a stage, as a share. Two runs of the same code agree within 0.5 %.
@@ -138,7 +139,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="make bench-instructions")
     parser.add_argument("words", nargs="*", metavar="WORD", help="count only stages with WORD in their names")
     parser.add_argument("--update", action="store_true", help="store the counts as the figures of this Python")
-    args = parser.parse_args()
+    add_json(parser)
+    args, program_run = parser.parse_args(), ProgramRun()
     if shutil.which("valgrind") is None:
         print("cannot find valgrind; try `make bench-deps` as root", file=sys.stderr)
         return 2
@@ -147,6 +149,8 @@ def main() -> int:
     except MeasurementError as error:
         print(f"cannot count instructions: {error}", file=sys.stderr)
         return 1
+    rows = [{"stage": stage, "instructions": count} for stage, count in measured.items()]
+    program_run.save(args.json, [Table("", rows)])
     build = python_build()
     kept = load().get(build)
     known = kept is not None and is_same_build(kept, measured)
