@@ -5,6 +5,7 @@
 # make test-pythons   the tests on every supported Python that is here; those that are missing are named
 # make check  ruff, mypy --strict, then the tests                   make bench  measurements, into build/bench.json
 #                                                                   (ARGS=--short: at most 5 minutes)
+# make report  measures and writes docs/measurements (ARGS="latency fleet": these pages; ARGS=--stored: without measuring)
 # make alerts every alert provoked, by a real Prometheus that scrapes a daemon: fires and clears, with a table of times
 # make signalk-deps   installs the Signal K server with npm into build/signalk, for the tests of the output signalk
 # make monitoring-deps   installs Prometheus and Alertmanager, for the tests of rules, examples and dashboard
@@ -125,6 +126,10 @@ bench-compare: $(VENV)/made
 # valgrind, which counts instructions; gpsd, which imud is compared with
 bench-deps:
 	apt-get install --yes --no-install-recommends valgrind gpsd
+
+.PHONY: report
+report: $(VENV)/made $(KERNEL)
+	$(BIN)/python -m docs.generate.report $(ARGS)
 
 audit: $(VENV)/made
 	$(BIN)/python -m tests.audit

@@ -472,6 +472,7 @@ CROSS_CUTTING = {
     "test_architecture.py": "the tree itself",
     "test_docs.py": "README.md, docs, Makefile",
     "test_end_to_end.py": "the daemon as a process, with its clients",
+    "test_report.py": "docs/generate/report.py and docs/measurements",
     "test_example_package.py": "docs/drivers.md and packages with drivers, outputs and simulators",
     "web/test_calibration_page.py": "the calibrations of imud/web/static in a real browser",
     "web/test_device_page.py": "the page of a device of imud/web/static in a real browser: vectors, status, settings",

@@ -1,9 +1,9 @@
 """Draws the pictures of docs/analysis.md: `python -m docs.generate.analysis_pictures` (`make pictures`).
 
-The commands draw simulated sensors with known noise. `noise.svg`: a gyroscope with the coefficients of the table in
-docs/analysis.md, two hours at 100 Hz. `noise_page.png`: the start of the page of `imud noise -o` for this gyroscope and
-an accelerometer, in chromium; without chromium, the picture does not change. `vibration.png`: an accelerometer at 400
-Hz on a starting motor; its crystal is 2 % fast, and 1 % of the samples are lost.
+The commands draw simulated sensors with known noise. `noise.svg`: a gyroscope with the coefficients that
+docs/analysis.md names, two hours at 100 Hz. `noise_page.png`: the start of the page of `imud noise -o` for this
+gyroscope and an accelerometer, in chromium; without chromium, the picture does not change. `vibration.png`: an
+accelerometer at 400 Hz on a starting motor; its crystal is 2 % fast, and 1 % of the samples are lost.
 """
 
 import shutil
