@@ -151,6 +151,8 @@ class Collector:
             assert self._changed.wait_for(true, limit_s), self.ledger.counts
 
     def close(self) -> None:
+        if not hasattr(self, "_client"):
+            return  # `closes` (gateways.py) has closed it
         self._client.disconnect()
         self._client.loop_stop()
         del self._client  # only its destructor closes the socket pair of its thread
