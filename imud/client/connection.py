@@ -1,11 +1,9 @@
 """A blocking client of the daemon's UNIX socket.
 
-    with Client() as imud:
-        print(imud.hello.version, [device["name"] for device in imud.devices()])
-        for sample in imud.watch(rate_hz=100):
-            print(sample.t_ns, sample.accel_m_s2)
-
-A lost connection raises LinkMissing. Make another Client to connect again. Synchronization: one thread at a time.
+with Client() as imud:
+    print(imud.hello.version, [device["name"] for device in imud.devices()])
+    for sample in imud.watch(rate_hz=100):
+        print(sample.t_ns, sample.accel_m_s2)
 """
 
 import errno
@@ -74,17 +72,19 @@ class ReceivedEvent(msgspec.Struct, frozen=True):
 
 
 class Watch:
-    """Iterator over samples. It ends when the client calls `watch` or `unwatch`.
+    """Iterator over samples, from `Client.watch`. It ends when the client calls `watch` or `unwatch`.
 
-    The iterator calls `on_dropped`, if it is set, with device and number before the first sample after the loss.
+    Raises TimeoutError if no sample arrives within the `timeout_s` of `Client.watch`, LinkMissing if the connection is
+    lost, and ServerError if it cannot decode a message.
     """
 
-    NAMES: Final = frozenset(("sample", "dropped", "device"))
+    NAMES: Final = frozenset(("sample", "dropped", "device"))  # methods of the notifications that the iterator reads
 
     def __init__(self, client: "Client", devices: Mapping[str, int], timeout_s: float | None) -> None:
-        self.device_ids = dict(devices)  # number of each device in slots
+        self.device_ids: dict[str, int] = dict(devices)  # number of each device in slots
         # number of samples per device that the daemon dropped because this client read too slowly
         self.dropped: dict[str, int] = {}
+        # function that the iterator calls with device and number before the first sample after a drop; None: no call
         self.on_dropped: Callable[[str, int], None] | None = None
         self._ended = False
         self._names = {number: name for name, number in self.device_ids.items()}
@@ -142,9 +142,9 @@ class Watch:
 
 
 class EventStream:
-    """Endless iterator over events."""
+    """Endless iterator over events, from `Client.events`. It raises the same errors as `Watch`."""
 
-    NAMES: Final = frozenset(("event",))
+    NAMES: Final = frozenset(("event",))  # methods of the notifications that the iterator reads
 
     def __init__(self, client: "Client", timeout_s: float | None) -> None:
         self._client = client
@@ -204,10 +204,10 @@ def _with_nan(value: object) -> object:
 class Hello(msgspec.Struct, frozen=True):
     """Greeting of the daemon."""
 
-    protocol: int
-    version: str
+    protocol: int  # version of the socket protocol
+    version: str  # version of imud
     epoch: int  # random number of this start of the daemon
-    rights: tuple[str, ...]  # `read`, `control`
+    rights: tuple[str, ...]  # permissions of this client: `read`, `control`
 
 
 class WatchReply(msgspec.Struct, frozen=True):
@@ -237,17 +237,19 @@ class SnapshotReply(msgspec.Struct, frozen=True):
 
 
 class Client:
-    """A connection to the daemon at `path`; None for `default_path()`.
+    """A connection to the daemon at `path`; None for `default_path()`. The end of a `with` block closes it.
 
     Every method raises LinkMissing (no daemon at the path, or connection lost), LinkDenied (no permission), RpcError
-    (the daemon refuses the request), ServerError (invalid reply), or TimeoutError (no reply within `timeout_s`).
+    (the daemon refuses the request), ServerError (invalid reply), or TimeoutError (no reply within `timeout_s`). After
+    LinkMissing, make another Client. Synchronization: one thread at a time.
     """
 
     def __init__(self, path: str | os.PathLike[str] | None = None, *, timeout_s: float = 5.0) -> None:
-        self.path = default_path() if path is None else os.fspath(path)
-        self.timeout_s = timeout_s
+        self.path: str = default_path() if path is None else os.fspath(path)  # path of the socket
+        self.timeout_s: float = timeout_s  # maximum time of a request, s
         self._buffer = bytearray()
-        self.discarded = 0  # number of messages above INBOX_MAX that the client discarded because no iterator read them
+        # number of messages that the client discarded because no iterator read them; it keeps the 65,536 newest
+        self.discarded: int = 0
         self._inbox: deque[Message] = deque()
         self._watch: Watch | None = None
         self._fds: list[int] = []
@@ -257,7 +259,7 @@ class Client:
         self._sock = _connect(self.path, timeout_s)
         with ExitStack() as undo:
             undo.callback(self.close)
-            self.hello = self._greet()
+            self.hello: Hello = self._greet()  # greeting of the daemon
             undo.pop_all()
 
     def __enter__(self) -> Self:
@@ -281,11 +283,11 @@ class Client:
     # --- requests ---------------------------------------------------------------------------------------------------
 
     def devices(self) -> list[dict[str, Any]]:
-        """Return the devices."""
+        """Return name, driver, link, state, identity, rate and ring file of each device (docs/socket.md)."""
         return self._request("devices", list[dict[str, Any]])
 
     def status(self) -> dict[str, Any]:
-        """Return the complete status: `now_ns`, `devices`, `socket`."""
+        """Return the complete status (docs/socket.md): `now_ns` (CLOCK_MONOTONIC), `devices`, `socket`."""
         return self._request("status", dict[str, Any])
 
     def schema(self) -> dict[str, Any]:
@@ -299,7 +301,8 @@ class Client:
         return [sample_of(params) for params in reply.samples]
 
     def call(self, method: str, **params: object) -> Any:
-        """Call a method and return its result as JSON values. Leave out the parameters that are None."""
+        """Call a method of the socket (docs/socket.md) and return its result as JSON values. Leave out the parameters
+        that are None."""
         self._id += 1
         while self._fds:  # descriptors of late replies
             os.close(self._fds.pop())
@@ -331,7 +334,9 @@ class Client:
     ) -> Watch:
         """Return an endless iterator over samples. It replaces the previous iterator.
 
-        - `devices`, `rate_hz`: None for all devices and every sample.
+        - `devices`: names of the devices, None for all devices.
+        - `rate_hz`: maximum number of samples per second and device, None for every sample.
+        - `encoding`: `binary` or `json`. Binary samples cost less CPU time.
         - `fields`: members of JSON samples, None for all. Other members are None. Binary samples are complete.
         - `convention`: `enu-flu`, `ned-frd`, or None for the convention of the configuration. ServerError if the daemon
           does not know it.
@@ -377,7 +382,7 @@ class Client:
 
     def history(self, devices: Iterable[str], **params: int | str | None) -> dict[str, list[Bucket]]:
         """Return minimum and maximum of the samples of the last hour by device. `params` are the other parameters of
-        the method: `from_ns`, `to_ns`, `points`, `convention`."""
+        the method (docs/socket.md): `from_ns`, `to_ns`, `points` (number of intervals), `convention`."""
         reply = self.call("history", devices=_listed(devices), **params)
         _check_convention(reply.get("convention"), params.get("convention"))
         return decoded(reply["devices"], dict[str, list[Bucket]], "history")
@@ -425,7 +430,8 @@ class Client:
         return None
 
     def next_message(self, names: frozenset[str], timeout_s: float | None) -> Message:
-        """Return the next message with a method in `names`; slots count as `sample`. Keep other messages."""
+        """Return the next message with a method in `names`: a JSON object, or the bytes of slots (`sample`). Keep other
+        messages. Raises TimeoutError if no such message arrives in `timeout_s`."""
         kept = self.kept_message(names)
         if kept is not None:
             return kept
@@ -454,7 +460,8 @@ class Client:
         return hello
 
     def descriptor(self, method: str) -> int:
-        """Return the descriptor of the last reply. Raises ServerError if the reply contained none."""
+        """Return the descriptor in the reply of `call(method)`; the caller closes it. Raises ServerError if it is
+        absent."""
         if not self._fds:
             raise ServerError(f"expected a descriptor in the reply to {method}, got a reply without it")
         return self._fds.pop()

@@ -65,7 +65,11 @@ class RingRead(NamedTuple):
 
 
 class Ring:
-    """An open ring. Synchronization: one thread. Every thread or process may open its own Ring."""
+    """An open ring of one device. The end of a `with` block closes it.
+
+    After a restart of the daemon, `read` and `latest` change to the new ring file. Synchronization: one thread. Every
+    thread or process may open its own Ring.
+    """
 
     def __init__(
         self, device_or_path: str | Path, *, directory: str | None = None, from_oldest: bool = False,
@@ -73,16 +77,18 @@ class Ring:
     ) -> None:  # fmt: skip
         """Open the ring of a device, or the file at a path that contains '/'.
 
-        - `directory`: folder of the rings; None for `default_directory`.
+        - `directory`: folder of the rings; None for `default_directory(device)`.
         - `from_oldest`: `read` begins with the oldest sample in the ring. Otherwise it begins with the next sample.
         - `owner_uid`: accepted owner of the file, in addition to root and the owner of its folder. Set it to the
           daemon's user if the folder is shared, such as /dev/shm.
+        - `now_ns`: function that returns CLOCK_MONOTONIC in ns, for tests.
 
         Raises ServerError if there is no ring, no permission, another owner, or another layout.
         """
         text = str(device_or_path)
-        self.path = Path(text) if "/" in text else ring_path(directory or default_directory(text), text)
-        self.missed = 0  # number of samples that `read` missed since opening
+        # path of the ring file
+        self.path: Path = Path(text) if "/" in text else ring_path(directory or default_directory(text), text)
+        self.missed: int = 0  # number of samples that `read` missed since opening
         self._now_ns = now_ns
         self._owner_uid = owner_uid
         self._change_to(_RingFile.open(self.path, owner_uid))

@@ -43,18 +43,19 @@ class Code(IntEnum):
 
     PARSE = -32700  # the line is not JSON
     INVALID_REQUEST = -32600  # the line is JSON and not a request
-    METHOD_NOT_FOUND = -32601
-    INVALID_PARAMS = -32602
-    INTERNAL = -32603
+    METHOD_NOT_FOUND = -32601  # the daemon does not know the method
+    INVALID_PARAMS = -32602  # a parameter is unknown, missing or out of range
+    INTERNAL = -32603  # fault of the daemon
     DENIED = -32001  # the client lacks the permission
-    TOO_MANY_CLIENTS = -32002
-    LINE_TOO_LONG = -32003
+    TOO_MANY_CLIENTS = -32002  # the limit of connections is reached
+    LINE_TOO_LONG = -32003  # the request is longer than 65,536 bytes
     UNAVAILABLE = -32004  # the daemon is temporarily unable to reply: out of descriptors
     FAILED = -32005  # the device rejected a command, did not reply, or is absent
 
 
 class RpcError(ServerError):
-    """Error reply of the server. `code` is a value of `Code` or a code of a newer server."""
+    """Error reply of the server. `code` is a value of `Code` or a code of a newer server. `data` contains values for
+    programs; None without such values."""
 
     def __init__(
         self, code: int, message: str, request_id: RequestId = None, data: Mapping[str, Any] | None = None

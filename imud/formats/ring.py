@@ -103,15 +103,15 @@ class RingHeader:
     """Header at one moment, without the ledger block."""
 
     epoch: int  # random number of the start of the daemon that made the ring
-    pid: int
-    state: int  # STATE_LIVE or STATE_CLOSED
-    device: str
-    device_id: int
-    slot_count: int  # a power of two
-    newest_seq: int = 0  # 0 before the first sample
+    pid: int  # process of the daemon
+    state: int  # 1: a daemon writes the ring; 2: the daemon closed the ring
+    device: str  # name of the device
+    device_id: int  # number of the device in slots
+    slot_count: int  # number of slots, a power of two
+    newest_seq: int = 0  # sequence number of the newest sample; 0 before the first sample
     first_seq: int = 1  # sequence number of the first sample in this ring
     heartbeat_ns: int = 0  # CLOCK_MONOTONIC of the newest heartbeat
-    ledger_count: int = len(LEDGER_FIELDS)
+    ledger_count: int = len(LEDGER_FIELDS)  # number of counters in the ledger
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,8 +119,8 @@ class LedgerBlock:
     """Ledger in shared memory, with the present driver."""
 
     update: int  # number of changes, starting at 1
-    driver: str  # empty until imud finds the device
-    ledger: dict[str, int]
+    driver: str  # name of the driver; empty until imud finds the device
+    ledger: dict[str, int]  # counters by name
 
 
 def default_directories(environment: Mapping[str, str]) -> list[str]:

@@ -35,9 +35,8 @@ class EventKind(StrEnum):
     ATTITUDE = "attitude"
     RECORDER = "recorder"  # the recorder stopped (for example: full disk), continued, lost records, or saved a snapshot
     MQTT = "mqtt"  # the output `mqtt` stopped spooling (for example: full disk) or continued
-    OUTPUT = (
-        "output"  # an exception in an output. imud starts this output again; the devices and other outputs continue.
-    )
+    # An exception in an output. imud starts this output again; the devices and other outputs continue.
+    OUTPUT = "output"
     # A rule of the output `rules` became active or ended (`detail.active`), or its command failed
     RULE = "rule"
     BAD_FRAME = "bad-frame"  # imud received a damaged or unknown frame. At most once per second and device.
@@ -63,16 +62,17 @@ class Event(msgspec.Struct, frozen=True, omit_defaults=True):
     """Event of one device, or of the daemon if `device` is empty."""
 
     t_ns: int  # CLOCK_MONOTONIC at the detection of the event
-    device: str
-    kind: EventKind
-    message: str  # Description, one sentence
+    device: str  # name of the device; empty for the daemon
+    kind: EventKind  # kind of the event; a string if a newer daemon sends a kind that this version does not know
+    message: str  # description, one sentence
     detail: dict[str, str | int | float | bool | None] = {}  # msgspec copies a mutable default
+    """Values by name, which depend on the kind."""
 
 
 class StoredEvent(Event, frozen=True, omit_defaults=True):
     """Group of equal events of one device. `t_ns`, `message` and `detail` belong to the newest event."""
 
-    count: int = 1
+    count: int = 1  # number of events in the group
     first_ns: int = 0  # CLOCK_MONOTONIC of the first event of the group
 
 
@@ -80,6 +80,7 @@ class PastEvents(msgspec.Struct, frozen=True):
     """Stored events, the oldest first."""
 
     events: list[StoredEvent] = []  # msgspec copies a mutable default
+    """Groups of events."""
     # CLOCK_MONOTONIC since which `events` has all events. It is later than requested if imud started later, or if it
     # removed older events.
     since_ns: int = 0

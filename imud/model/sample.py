@@ -18,9 +18,9 @@ Pair = tuple[float, float]
 class Position(msgspec.Struct, frozen=True, gc=False, omit_defaults=True):
     """Position on the WGS 84 ellipsoid."""
 
-    latitude_rad: float  # positive to the north
-    longitude_rad: float  # positive to the east
-    height_m: float | None = None  # height above mean sea level
+    latitude_rad: float  # latitude, positive to the north
+    longitude_rad: float  # longitude, positive to the east
+    height_m: float | None = None  # height above mean sea level; None if the device does not send it
     quality: int | None = None  # quality of the position solution as sent, 0 … 254 (0: invalid)
     satellites: int | None = None  # number of satellites in the solution, 0 … 254
 
