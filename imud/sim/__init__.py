@@ -1,10 +1,36 @@
-"""Simulated devices with known truth, for `imud demo` and the tests."""
+"""Simulated devices with known truth, for `imud sim`, `imud demo` and tests.
+
+`SIMULATORS` and `CAN_SIMULATORS` make devices from `SimulatorOptions`. `Faults` damages their bytes. `SimulatedPort`
+connects a device to a pseudo-terminal. `__all__` is the public interface (docs/simulators.md).
+"""
 
 from imud.contracts.registry import PluginGroup, Registry
-from imud.sim.can_module import CanSimulator
-from imud.sim.sensor import Simulator
+from imud.sim.can_module import CanModule, CanModules, CanSimulator, FrameWire, PeriodicCanModule, SentFrame
+from imud.sim.physics import MOTIONS, Motion, Noise, NoiseLevels, Sine, Still, Swing, Truth
+from imud.sim.ports.arrival import BARE_UART, USB_1MS, USB_16MS, ArrivalProfile
+from imud.sim.ports.faults import Fault, FaultKind, FaultRates, Faults, rates_from
+from imud.sim.ports.pty import Adapter, PtyCounters, PtyNode, SimulatedPort
+from imud.sim.ports.uart_wire import Transmitter
+from imud.sim.sensor import (
+    Burst,
+    Pin,
+    PinEdge,
+    SensorHardware,
+    Simulator,
+    SimulatorOptions,
+    StreamModule,
+    sensor_of,
+)
 
-# Simulated devices on a pseudo-terminal.
+__all__ = [
+    "BARE_UART", "CAN_SIMULATORS", "MOTIONS", "SIMULATORS", "USB_1MS", "USB_16MS", "Adapter", "ArrivalProfile",
+    "Burst", "CanModule", "CanModules", "CanSimulator", "Fault", "FaultKind", "FaultRates", "Faults", "FrameWire",
+    "Motion", "Noise", "NoiseLevels", "PeriodicCanModule", "Pin", "PinEdge", "PtyCounters", "PtyNode",
+    "SensorHardware", "SentFrame", "SimulatedPort", "Simulator", "SimulatorOptions", "Sine", "Still",
+    "StreamModule", "Swing", "Transmitter", "Truth", "rates_from", "sensor_of",
+]  # fmt: skip
+
+# Simulators of devices on a serial port, by the name of the driver, also of other packages.
 SIMULATORS: Registry[Simulator] = Registry(
     "simulator",
     {
@@ -15,7 +41,7 @@ SIMULATORS: Registry[Simulator] = Registry(
     PluginGroup("imud.simulators", Simulator),
 )
 
-# Simulated devices on a CAN interface.
+# Simulators of devices on a CAN interface, by the name of the driver, also of other packages.
 CAN_SIMULATORS: Registry[CanSimulator] = Registry(
     "simulator on CAN",
     {

@@ -27,9 +27,9 @@ class SentFrame(NamedTuple):
     """A frame that was sent completely."""
 
     due_ns: int  # CLOCK_MONOTONIC of the end of the frame
-    can_id: int
-    extended: bool
-    data: bytes
+    can_id: int  # identifier
+    extended: bool  # True for a 29-bit identifier
+    data: bytes  # 0 to 8 bytes; 0 to 64 bytes for CAN FD
     sample_ns: int | None = None  # CLOCK_MONOTONIC of the measurement; None if the frame contains no measurement
 
 
@@ -81,6 +81,7 @@ class FrameWire:
     def __init__(self, bitrate: int, free_ns: int) -> None:
         """`bitrate` 0: frames take no time, so that frames of one instant leave together. The wire is busy until
         `free_ns`."""
+        # time of a frame with 8 bytes and an identifier of 11 bits, of 29 bits, ns
         self.frame_ns, self.extended_ns = (
             (frame_bits(extended, DATA_BYTES_MAX) + STUFF_BITS) * NS_PER_S // bitrate if bitrate else 0
             for extended in (False, True)
@@ -131,15 +132,16 @@ class PeriodicCanModule:
     ) -> None:
         """`encode` returns the frames (identifier, data) of a sample from its number and its measurement. Numbers start
         at `first_number` after the first power-on, at 0 after a restart."""
-        self.epoch_ns = now_ns
-        self.samples_sent = 0
-        self.frames_sent = 0
+        self.epoch_ns: int = now_ns  # zero of the motion, CLOCK_MONOTONIC
+        self.samples_sent: int = 0  # number of samples
+        self.frames_sent: int = 0  # number of frames
         self._hardware, self._encode, self._extended = hardware, encode, extended
         self._period_ns = NS_PER_S / rate_hz / (1 + hardware.skew_ppm * 1e-6)
         self._bitrate = bitrate
         self._power_on(now_ns, first_number)
 
-    def receive(self, can_id: int, extended: bool, data: bytes, now_ns: int) -> None: ...
+    def receive(self, can_id: int, extended: bool, data: bytes, now_ns: int) -> None:
+        """Ignore a frame of another node."""
 
     def mark(self, now_ns: int) -> None:
         """Do nothing: the device has no sync input."""
@@ -149,6 +151,7 @@ class PeriodicCanModule:
         self._power_on(now_ns, 0)
 
     def advance(self, now_ns: int) -> list[SentFrame]:
+        """Return the frames sent since the last call, in order."""
         while (sample_ns := self._sample_ns()) <= now_ns:
             reading = self._hardware.reading((sample_ns - self.epoch_ns) / NS_PER_S)
             for can_id, data in self._encode(self._first_number + self._sampled, reading):
@@ -159,6 +162,7 @@ class PeriodicCanModule:
         return self._wire.sent(now_ns)
 
     def next_ns(self) -> int | None:
+        """Return the time of the next frame of `advance`."""
         waiting = self._wire.next_ns()
         if waiting is not None:
             return waiting
@@ -166,6 +170,7 @@ class PeriodicCanModule:
         return self._sample_ns() + self._hardware.processing_ns + frame_ns
 
     def counters(self) -> dict[str, int]:
+        """Return the numbers of samples and frames by name."""
         return {"samples_sent": self.samples_sent, "frames_sent": self.frames_sent}
 
     def _power_on(self, now_ns: int, first_number: int) -> None:
@@ -185,10 +190,11 @@ class CanModules:
         """Raises ValueError if `modules` is empty."""
         if not modules:
             raise ValueError("expected at least one device, got none")
-        self.modules = tuple(modules)
-        self.epoch_ns = modules[0].epoch_ns
+        self.modules: tuple[CanModule, ...] = tuple(modules)  # the devices
+        self.epoch_ns: int = modules[0].epoch_ns  # zero of the motion of the first device, CLOCK_MONOTONIC
 
     def receive(self, can_id: int, extended: bool, data: bytes, now_ns: int) -> None:
+        """Pass a frame of another node to all devices."""
         for module in self.modules:
             module.receive(can_id, extended, data, now_ns)
 
@@ -201,6 +207,7 @@ class CanModules:
         return list(merge(*sent, key=lambda frame: frame.due_ns))
 
     def next_ns(self) -> int | None:
+        """Return the time of the next frame of `advance`; None if no frame is due."""
         return min((due_ns for module in self.modules if (due_ns := module.next_ns()) is not None), default=None)
 
     def counters(self) -> dict[str, int]:

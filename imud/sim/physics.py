@@ -35,14 +35,14 @@ class Truth(NamedTuple):
     """Measurement of an ideal sensor at one instant. Vectors are in the right-handed sensor frame."""
 
     accel_m_s2: Vector3  # specific force, m/s²: +g on the axis that points up at rest
-    gyro_rad_s: Vector3
-    mag_t: Vector3
+    gyro_rad_s: Vector3  # angular rate, rad/s
+    mag_t: Vector3  # magnetic flux density, T
     euler_rad: Vector3  # roll (about Y), pitch (about X), yaw (about Z, counter-clockwise), order 312
     quat_wxyz: Quaternion  # rotation from body to ENU
-    temperature_c: float
-    pressure_pa: float
-    position_enu_m: Vector3 = (0.0, 0.0, 0.0)  # from the start of the motion
-    velocity_enu_m_s: Vector3 = (0.0, 0.0, 0.0)
+    temperature_c: float  # temperature of the sensor, °C
+    pressure_pa: float  # air pressure, Pa
+    position_enu_m: Vector3 = (0.0, 0.0, 0.0)  # position from the start of the motion, east, north, up, m
+    velocity_enu_m_s: Vector3 = (0.0, 0.0, 0.0)  # velocity, east, north, up, m/s
 
 
 class Motion(Protocol):
@@ -57,9 +57,9 @@ class Motion(Protocol):
 class Sine:
     """A term of a motion: amplitude · sin(2π · frequency · t + phase)."""
 
-    amplitude: float
-    frequency_hz: float
-    phase_rad: float = 0.0
+    amplitude: float  # in rad for an angle, in m for a coordinate
+    frequency_hz: float  # frequency, Hz
+    phase_rad: float = 0.0  # phase at the zero of the motion, rad
 
 
 Sines = tuple[Sine, ...]
@@ -80,15 +80,16 @@ class Swing:
         gravity_m_s2: float = GRAVITY_M_S2,
         field_enu_t: Vector3 = FIELD_ENU_T,
     ) -> None:
-        """Angles in rad, position in m. Pitch stays within ±90°, where order 312 is unique."""
+        """Angles in rad, position in m. Raises ValueError if the pitch can reach ±90°: order 312 is ambiguous there."""
         if sum(abs(term.amplitude) for term in pitch) >= pi / 2:
             raise ValueError("expected a pitch below 90°, because roll and yaw are undefined at 90°")
         self._roll, self._pitch, self._yaw = _terms(roll), _terms(pitch), _terms(yaw)
         self._east, self._north, self._up = (_terms(axis) for axis in position_enu)
-        self.gravity_m_s2 = gravity_m_s2
-        self.field_enu_t = field_enu_t
+        self.gravity_m_s2: float = gravity_m_s2  # local gravity, m/s²
+        self.field_enu_t: Vector3 = field_enu_t  # magnetic field of the place, east, north, up, T
 
     def at(self, t_s: float) -> Truth:
+        """Return the truth at `t_s` seconds after the zero of the motion."""
         roll, roll_rate = _value_and_rate(self._roll, t_s)
         pitch, pitch_rate = _value_and_rate(self._pitch, t_s)
         yaw, yaw_rate = _value_and_rate(self._yaw, t_s)
@@ -177,6 +178,7 @@ class Still:
         self._truth = swing.at(0.0)
 
     def at(self, t_s: float) -> Truth:
+        """Return the truth at `t_s` seconds after the zero of the motion."""
         warming_c = WARMING_C * sin(2 * pi / WARMING_PERIOD_S * t_s)
         return self._truth._replace(temperature_c=TEMPERATURE_C + warming_c)
 
@@ -265,13 +267,13 @@ class NoiseLevels:
     0.2 Pa. The biases are assumptions.
     """
 
-    accel_m_s2: float = 0.006
-    gyro_rad_s: float = 0.0006
-    mag_t: float = 0.2e-6
-    accel_bias_m_s2: float = 0.02
-    gyro_bias_rad_s: float = 0.0005
-    mag_bias_t: float = 0.3e-6
-    pressure_pa: float = 0.2
+    accel_m_s2: float = 0.006  # noise of the specific force, m/s²
+    gyro_rad_s: float = 0.0006  # noise of the angular rate, rad/s
+    mag_t: float = 0.2e-6  # noise of the magnetic flux density, T
+    accel_bias_m_s2: float = 0.02  # maximum bias of the specific force, m/s²
+    gyro_bias_rad_s: float = 0.0005  # maximum bias of the angular rate, rad/s
+    mag_bias_t: float = 0.3e-6  # maximum bias of the magnetic flux density, T
+    pressure_pa: float = 0.2  # noise of the air pressure, Pa
     # Period of the bias of the first axis, s. The periods of the other axes are slightly longer.
     bias_period_s: float = 300.0
 
@@ -294,6 +296,7 @@ class Noise:
         return (accel * a, accel * b, accel * c), (gyro * d, gyro * e, gyro * f), (mag * g, mag * h, mag * i)
 
     def add(self, truth: Truth, t_s: float) -> Truth:
+        """Return the truth at `t_s` seconds after the zero of the motion with noise and bias."""
         levels = self._levels
         accel_bias, gyro_bias, mag_bias = self.bias(t_s)
         accel, gyro, mag, euler, quat, temperature_c, pressure_pa, *_ = truth

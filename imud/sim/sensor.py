@@ -14,7 +14,7 @@ class Burst(NamedTuple):
     """Bytes that leave the device in one piece."""
 
     due_ns: int  # CLOCK_MONOTONIC of the end of the last byte on the wire
-    data: bytes
+    data: bytes  # bytes of the frame or the reply
     sample_ns: int | None = None  # CLOCK_MONOTONIC of the measurement; None for text
     device_ms: int | None = None  # device time of the measurement since power-on, ms, without wrap
 
@@ -31,8 +31,8 @@ class PinEdge(NamedTuple):
     """A change of a pin's level."""
 
     due_ns: int  # CLOCK_MONOTONIC of the change
-    pin: Pin
-    rising: bool
+    pin: Pin  # name of the pin
+    rising: bool  # True for a rising edge
     sample_ns: int | None = None  # CLOCK_MONOTONIC of the measurement in the next frame; None if no frame follows
 
 
@@ -84,7 +84,9 @@ class SimulatorOptions:
     motion: str = "swing"
     """Row of `imud.sim.physics.MOTIONS`."""
     gravity_m_s2: float = GRAVITY_M_S2
+    """Local gravity, m/s²."""
     noise: Literal["real", "none"] = "real"
+    """`real`: noise and bias of a device at rest (`NoiseLevels`); `none`: a perfect sensor."""
     skew_ppm: float = 20.0
     """Rate error of the crystal relative to the host clock, 1e-6."""
     firmware: int = 0
@@ -94,6 +96,7 @@ class SimulatorOptions:
     processing_ns: int = 125_000
     """Time from the measurement to the first bit on the wire, ns."""
     seed: int = 1
+    """Seed of the noise. The same seed gives the same samples."""
     node: int = 0
     """Node, address or first identifier of the device on its bus; 0: the default of the factory."""
     variant: str = ""
@@ -129,8 +132,8 @@ class Simulator:
 class SensorHardware:
     """Hardware of each simulated sensor, for all links."""
 
-    motion: Motion = field(default_factory=swing)
-    noise: Noise | None = None
+    motion: Motion = field(default_factory=swing)  # motion of the sensor
+    noise: Noise | None = None  # noise of the sensor; None for a perfect sensor
     skew_ppm: float = 20.0  # rate error of the crystal relative to the host clock, 1e-6
     boot_ms: int = 500  # silence after power-on and restart, ms
     processing_ns: int = 125_000  # time from the measurement to the first bit on the wire, ns
@@ -150,7 +153,7 @@ class SensorFields(TypedDict):
 
 
 def sensor_of(options: SimulatorOptions) -> SensorFields:
-    """Return the sensor of the options. Raises ValueError for an unknown motion."""
+    """Return the arguments of `SensorHardware` for the options. Raises ValueError for an unknown motion."""
     return {
         "motion": motion_of(options),
         "noise": noise_of(options),

@@ -29,7 +29,9 @@ class Crystal:
 
 @dataclass(frozen=True, slots=True)
 class ArrivalProfile:
-    name: str
+    """Delays between the wire of the device and the program that reads it. `Adapter` uses only the latency timer."""
+
+    name: str  # name of the profile
     timer_ns: int = 0  # period of the latency timer, ns; 0 for no timer
     # Rate error of the timer relative to the host clock, 1e-6; 0 runs in lockstep with an exact device.
     timer_ppm: float = 0.0
@@ -50,13 +52,16 @@ class ArrivalProfile:
 
 
 PERFECT = ArrivalProfile("perfect")
+# UART of the host, without a latency timer
 BARE_UART = ArrivalProfile(
     "bare-uart", fifo_bytes=4, floor_ns=30 * NS_PER_US, wake_ns=30 * NS_PER_US, stall_share=0.005, stall_ns=NS_PER_MS
 )
+# USB adapter with a latency timer of 1 ms
 USB_1MS = ArrivalProfile(
     "usb-1ms", timer_ns=NS_PER_MS, timer_ppm=-30, poll_ns=125 * NS_PER_US, floor_ns=30 * NS_PER_US,
     wake_ns=40 * NS_PER_US, stall_share=0.005, stall_ns=NS_PER_MS,
 )  # fmt: skip
+# USB adapter with a latency timer of 16 ms, the default of FTDI
 USB_16MS = ArrivalProfile(
     "usb-16ms", timer_ns=16 * NS_PER_MS, timer_ppm=-30, poll_ns=125 * NS_PER_US, floor_ns=30 * NS_PER_US,
     wake_ns=40 * NS_PER_US, stall_share=0.005, stall_ns=NS_PER_MS,

@@ -37,10 +37,10 @@ class CanPort:
         self, module: CanModule, interface: str, *, open_socket: Callable[[str], socket.socket] | None = None
     ) -> None:
         """`open_socket` is `open_can_socket` or a substitute of a test. Raises the errors of `open_socket`."""
-        self.module = module
-        self.interface = interface
+        self.module: CanModule = module  # the device or the devices
+        self.interface: str = interface  # name of the interface
         self._unplugged_until_ns = 0
-        self.frames_refused = 0  # number of frames that the queue of the interface did not accept
+        self.frames_refused: int = 0  # number of frames that the queue of the interface did not accept
         self._socket = (open_socket or open_can_socket)(interface)
 
     def fileno(self) -> int:
@@ -76,6 +76,7 @@ class CanPort:
         return {**counters, "epoch_ns": self.module.epoch_ns}
 
     def close(self) -> None:
+        """Close the socket. A second call does nothing."""
         self._socket.close()
 
     def _receive(self, now_ns: int) -> None:

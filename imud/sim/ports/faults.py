@@ -24,6 +24,8 @@ WRONG_BAUDS: Final = (9600, 115_200, 230_400, 256_000, 460_800, 921_600)
 
 
 class FaultKind(StrEnum):
+    """Kinds of faults."""
+
     CUT = "cut"  # the end of the burst is missing, at least one byte
     FLIP = "flip"  # one bit is wrong
     DROP = "drop"  # one byte is missing
@@ -42,18 +44,21 @@ _Order = (
 
 @dataclass(frozen=True, slots=True)
 class FaultRates:
-    """Probability of each fault per burst, 0 to 1, and the duration of lasting faults."""
+    """Probability of each fault per burst, 0 to 1, and the duration of lasting faults.
 
-    cut: float = 0.0
-    flip: float = 0.0
-    drop: float = 0.0
-    insert: float = 0.0
-    delay: float = 0.0
-    unplug: float = 0.0
-    wrong_baud: float = 0.0
-    lose: float = 0.0
+    Raises ValueError for a probability out of range.
+    """
+
+    cut: float = 0.0  # probability of `FaultKind.CUT`
+    flip: float = 0.0  # probability of `FaultKind.FLIP`
+    drop: float = 0.0  # probability of `FaultKind.DROP`
+    insert: float = 0.0  # probability of `FaultKind.INSERT`
+    delay: float = 0.0  # probability of `FaultKind.DELAY`
+    unplug: float = 0.0  # probability of `FaultKind.UNPLUG`
+    wrong_baud: float = 0.0  # probability of `FaultKind.WRONG_BAUD`
+    lose: float = 0.0  # probability of `FaultKind.LOSE`
     delay_ns: int = 5 * NS_PER_MS  # maximum delay, ns
-    unplug_ns: int = 300 * NS_PER_MS
+    unplug_ns: int = 300 * NS_PER_MS  # time until the port appears again, ns
 
     def __post_init__(self) -> None:
         for kind in FaultKind:
@@ -66,7 +71,9 @@ class FaultRates:
 
 
 class Fault(NamedTuple):
-    kind: FaultKind
+    """A fault that happened."""
+
+    kind: FaultKind  # kind of the fault
     due_ns: int  # time of the end of the undisturbed burst, ns
     burst: int  # number of the burst, from 0
     sample_ns: int | None  # time of the measurement in the disturbed frame, ns; None for text
@@ -76,13 +83,13 @@ class Faults:
     """Injector of faults into bursts. The same seed and the same bursts give the same faults."""
 
     def __init__(self, seed: int, rates: FaultRates, baud: int = 115_200) -> None:
-        self.rates = rates
-        self.baud = baud  # Baud rate of the device, bit/s. A wrong baud rate is any other rate.
-        self.log: list[Fault] = []
-        self.counts: Counter[FaultKind] = Counter()
-        self.bursts = 0
-        self.bursts_hit = 0  # number of changed or lost bursts, without late bursts
-        self.unplugged_until_ns = 0
+        self.rates: FaultRates = rates  # probabilities
+        self.baud: int = baud  # Baud rate of the device, bit/s. A wrong baud rate is any other rate.
+        self.log: list[Fault] = []  # faults in order of time, at most 100,000
+        self.counts: Counter[FaultKind] = Counter()  # number of faults of each kind
+        self.bursts: int = 0  # number of bursts
+        self.bursts_hit: int = 0  # number of changed or lost bursts, without late bursts
+        self.unplugged_until_ns: int = 0  # CLOCK_MONOTONIC until which the port is absent
         self._random = Random(seed)
         self._held_until_ns = 0
 

@@ -42,18 +42,18 @@ LOOK_NS: Final = 20 * NS_PER_MS
 class PtyCounters:
     """Numbers of sent and lost bytes of the device."""
 
-    bytes_written: int = 0
+    bytes_written: int = 0  # number of bytes that the terminal accepted
     bytes_unheard: int = 0  # number of bytes that were lost because no program had opened the port
     bytes_lost_full: int = 0  # number of bytes that were lost because the reader was too slow
     bursts_wrong_baud: int = 0  # number of bursts that were sent while the reader had another baud rate
-    unplugs: int = 0
+    unplugs: int = 0  # number of calls of `SimulatedPort.unplug`, also by faults
 
 
 class PtyNode:
     """A pseudo-terminal with a name that stays the same after each plug."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path: Path = path  # name of the port
         self._master = -1
         self._poll = select.poll()
 
@@ -97,6 +97,7 @@ class PtyNode:
         return int(TERMIOS2.unpack(fcntl.ioctl(self._master, TCGETS2, bytes(TERMIOS2.size)))[6])
 
     def read(self) -> bytes:
+        """Return the bytes that the program sent, at most 4096; empty if no byte arrived."""
         try:
             return os.read(self._master, READ_BYTES)
         except OSError:  # no bytes, or the program closed the port (EIO)
@@ -146,8 +147,9 @@ class SimulatedPort:
         truth: TextIO | None = None,
     ) -> None:
         """`truth` gets one line per completely sent frame: sample_ns, device_ms, written_ns."""
-        self.module, self.node = module, node
-        self.counters = PtyCounters()
+        self.module: StreamModule = module  # the device
+        self.node: PtyNode = node  # the terminal
+        self.counters: PtyCounters = PtyCounters()  # numbers of sent and lost bytes
         self._adapter, self._faults, self._truth = adapter, faults, truth
         self._held: deque[Burst] = deque()
         self._replug_ns: int | None = None
@@ -186,6 +188,7 @@ class SimulatedPort:
         self._replug_ns = now_ns + duration_ns
 
     def close(self) -> None:
+        """Remove the terminal. A second call does nothing."""
         self.node.unplug()
 
     def summary(self) -> dict[str, int]:

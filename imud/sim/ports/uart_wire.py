@@ -16,7 +16,7 @@ class Transmitter:
 
     def __init__(self, baud: int, buffer_bytes: int, free_ns: int) -> None:
         """The wire is busy until `free_ns`."""
-        self.baud = baud
+        self.baud: int = baud  # baud rate, bit/s
         self._buffer_ns = self.wire_ns(buffer_bytes)
         self._free_ns = free_ns
         self._waiting: deque[Burst] = deque()
