@@ -126,19 +126,38 @@ def imud_lines() -> Iterator[list[str]]:
     return (words[1:] for _, words in shell_commands() if words[0] == "imud")
 
 
+def all_pages() -> list[Path]:
+    """Return all Markdown files of the repository."""
+    return [
+        *ROOT.glob("*.md"),
+        *(page for part in ("docs", "packaging", "tests") for page in (ROOT / part).rglob("*.md")),
+    ]
+
+
 def test_links_and_their_anchors_lead_somewhere() -> None:
-    targets = [(page, target) for page in PAGES for target in LINK.findall(page.read_text()) if "://" not in target]
+    pages = all_pages()
+    assert {*PAGES, ROOT / "tests/lab/README.md"} <= {*pages}
+    targets = [(page, target) for page in pages for target in LINK.findall(prose(page)) if "://" not in target]
     assert [(page.name, target) for page, target in targets if not (page.parent / target).exists()] == []
-    for page in PAGES:
-        for target, anchor in ANCHOR_LINK.findall(page.read_text()):
+    for page in pages:
+        for target, anchor in ANCHOR_LINK.findall(prose(page)):
             linked = page.parent / target if target else page
             if linked.suffix == ".md":
                 assert anchor in anchors(linked), f"{page.name}: {target}#{anchor}"
 
 
+def without_blocks(page: Path) -> str:
+    return re.sub(r"^ *```.*?^ *```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+
+
+def prose(page: Path) -> str:
+    """Return the text of a page without code, which can look like a link: `MOTIONS[name](9.8)`."""
+    return re.sub(r"`[^`\n]*`", "", without_blocks(page))
+
+
 def anchors(page: Path) -> set[str]:
     """Return the anchors of the titles of a page, as GitHub makes them."""
-    text = re.sub(r"^ *```.*?^ *```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    text = without_blocks(page)
     titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
     named = re.findall(r'<a (?:id|name)="([^"]+)"', text)
     return {
