@@ -1,6 +1,7 @@
 """Test the documents: commands, configurations, programs, links, generated tables."""
 
 import configparser
+import importlib.util
 import os
 import re
 import shlex
@@ -12,12 +13,12 @@ import tomllib
 from collections.abc import Iterator, Sequence
 from itertools import groupby, pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import pytest
 
-from docs.generate import pictures, references
+from docs.generate import pictures, python_reference, references
 from imud import config
 from imud.cli import COMMANDS, build_parser, main
 from imud.drivers import DRIVERS
@@ -284,9 +285,9 @@ def test_the_reader_continues_after_a_restart(tmp_path: Path) -> None:
 
 @pytest.mark.live
 def test_examples_read_from_a_running_daemon(tmp_path: Path) -> None:
-    texts = [e.text for e in examples("python") if e.page.name == "README.md"]
+    texts = [e.text for e in examples("python") if e.page.name in ("README.md", "python.md")]
     commands = [[sys.executable, "-u", "-c", text] for text in texts]
-    assert len(commands) == 2
+    assert len(commands) == 5
     if shutil.which("cc") is not None:
         commands.append([compiled_reader(tmp_path)])
     places = {"IMUD_SOCKET": str(tmp_path / "imud.sock"), "IMUD_SHM": str(tmp_path)}
@@ -297,7 +298,28 @@ def test_examples_read_from_a_running_daemon(tmp_path: Path) -> None:
                 line = process.stdout.readline()
                 process.kill()
             assert "9.8" in line, line
-    assert len(commands) == 2 or re.fullmatch(r"\d+ ns: 9\.800000 m/s2\n", line)
+    assert len(commands) == 5 or re.fullmatch(r"\d+ ns: 9\.800000 m/s2\n", line)
+
+
+def simulator_examples() -> list[str]:
+    return [example.text for example in examples("python") if example.page.name == "simulators.md"]
+
+
+@pytest.mark.live
+def test_example_of_a_test_passes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names: dict[str, Any] = {}
+    exec(simulator_examples()[0], names)
+    names["test_a_removed_cable"](tmp_path)
+    assert re.search(r"^no samples for [\d.]+ s$", capsys.readouterr().out, re.MULTILINE)
+
+
+def test_examples_of_simulators_print_the_values_of_the_page(capsys: pytest.CaptureFixture[str]) -> None:
+    page = " ".join((ROOT / "docs/simulators.md").read_text().split())
+    for text in simulator_examples()[1:]:
+        exec(text, {})
+    printed, truth = capsys.readouterr().out.splitlines()
+    assert f"`{printed}`" in page
+    assert truth.startswith("(3.55")
 
 
 def compiled_reader(folder: Path) -> str:
@@ -353,3 +375,52 @@ def test_generated_parts_are_those_of_the_code_with_its_actions_and_layouts() ->
         for action in driver.verbs:
             assert f"\n| `{action}` | " in text, action
     assert "| 0 | `uint64_t` | `seq` |" in references.current("docs/shm.md")
+
+
+PACKAGE = '''
+"""A package."""
+from typing import NamedTuple
+__all__ = ["Level", "LIMIT", "Broken", "height"]
+LIMIT = 3  # maximum level, m
+class Broken(ValueError):
+    """Broken level."""
+class Level(NamedTuple):
+    """A level."""
+    low_m: float  # lower end, m
+    # upper end, m
+    high_m: float = 1.0
+    def span(self, scale: float = 1.0) -> float:
+        """Return the difference, m."""
+        return scale * (self.high_m - self.low_m)
+def height() -> float:
+    """Return the height, m."""
+    return 0.0
+'''
+
+
+def reference_of(source: str, folder: Path) -> str:
+    name = f"made_{len(source)}"
+    file = folder / f"{name}.py"
+    file.write_text(source)
+    spec = importlib.util.spec_from_file_location(name, file)
+    assert spec is not None
+    assert spec.loader is not None
+    package = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(package)
+    sys.modules[name] = package  # inspect finds the source of a class by its module
+    try:
+        return python_reference.python_reference(package)
+    finally:
+        del sys.modules[name]
+
+
+def test_reference_of_python_has_a_description_of_each_public_name(tmp_path: Path) -> None:
+    text = reference_of(PACKAGE, tmp_path)
+    assert "| `low_m` | `float` | Lower end, m |\n| `high_m` | `float = 1.0` | Upper end, m |" in text
+    assert "#### `Level.span`\n\n```text\nspan(scale: float = 1.0) -> float\n```\n\nReturn the difference, m." in text
+    assert "### `LIMIT`\n\nMaximum level, m" in text
+    assert text.endswith("| `Broken` | `ValueError` | Broken level. |")
+    for words in ("# maximum level, m", "# lower end, m", '"""Return the difference, m."""', '"""Broken level."""'):
+        without = PACKAGE.replace(words, "0" if words.startswith('"') else "#")
+        with pytest.raises(ValueError, match="expected a docstring or a comment"):
+            reference_of(without, tmp_path)

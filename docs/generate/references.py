@@ -7,6 +7,7 @@
 | docs/shm.md | layout of shared memory |
 | docs/monitoring.md | rules for Prometheus |
 | docs/stability.md | versions of the interfaces (tests/stability/interfaces.py) |
+| docs/python.md, docs/simulators.md | docstrings and signatures (docs/generate/python_reference.py) |
 | docs/socket.schema.json | messages of the socket (docs/generate/socket_schema.py) |
 """
 
@@ -21,7 +22,10 @@ from typing import Final, NamedTuple, get_args
 
 import msgspec
 
+import imud.client
+import imud.sim
 from docs.generate.alert_table import alert_table
+from docs.generate.python_reference import python_reference
 from docs.generate.socket_schema import socket_schema
 from imud.attitude.published import FrameOptions, MountingAngles, MountingAxes
 from imud.config.schema import TABLES, DeviceGeneral, General
@@ -395,6 +399,14 @@ def versions() -> str:
 
     rows = [f"| [{name}](#{name}) | {one.version} | {one.read} |" for name, one in INTERFACES.items()]
     return "\n".join(["| interface | version | a program reads it from |", "|---|---|---|", *rows])
+# --- docs/simulators.md -----------------------------------------------------------------------------------------------
+
+
+def simulators_table() -> str:
+    rows = ["| name | device | table |", "|---|---|---|"]
+    rows += [f"| `{one.name}` | {one.title} | `SIMULATORS` |" for one in imud.sim.SIMULATORS.values()]
+    rows += [f"| `{one.name}` | {one.title} | `CAN_SIMULATORS` |" for one in imud.sim.CAN_SIMULATORS.values()]
+    return "\n".join(rows)
 
 
 # --- all --------------------------------------------------------------------------------------------------------------
@@ -407,6 +419,8 @@ PAGES: Final[Mapping[str, Callable[[], Mapping[str, str]]]] = {
     "docs/shm.md": layout_tables,
     "docs/monitoring.md": lambda: {"alerts": alert_table()},
     "docs/stability.md": lambda: {"versions": versions()},
+    "docs/python.md": lambda: {"reference": "\n" + python_reference(imud.client)},
+    "docs/simulators.md": lambda: {"devices": simulators_table(), "reference": "\n" + python_reference(imud.sim)},
 }
 
 
