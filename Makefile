@@ -19,6 +19,7 @@
 # make web-deps   installs chromium and its driver, for the tests of the page of `imud web`
 # make pictures   the pictures of README.md and docs/, into docs/pictures
 # make web-pictures   the pictures of `imud web`, in a real browser, into docs/pictures
+# make docs-site      the documents as a site with a search, into build/site; fails on a dead link
 # make fuzz   every decoder of foreign bytes, 60 s each, with a table
 # make sanitize   tests of the C kernel with AddressSanitizer and UndefinedBehaviorSanitizer
 # make audit  items of both manuals and of newer firmware: code and tests of each
@@ -157,6 +158,15 @@ pictures: $(VENV)/made
 	$(BIN)/python -m docs.generate.pictures
 	$(BIN)/python -m docs.generate.terminal_pictures
 	$(BIN)/python -m docs.generate.analysis_pictures
+
+$(VENV)/made-docs: $(VENV)/made-runtime
+	@echo "Installing Sphinx into $(VENV), about 50 MB"
+	$(PIP) install --quiet --editable '.[docs]'
+	@touch $@
+
+.PHONY: docs-site
+docs-site: $(VENV)/made-docs
+	$(BIN)/python -m docs.generate.site
 
 # Coverage-guided fuzzing: ARGS="--seconds 60 --seed 25" in CI, ARGS="--seconds 3600 --target stream/" by hand.
 $(VENV)/made-fuzz: $(VENV)/made

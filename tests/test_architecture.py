@@ -471,6 +471,7 @@ CROSS_CUTTING = {
     "sim/test_main.py": "imud/sim/__main__.py as a process",
     "test_architecture.py": "the tree itself",
     "test_docs.py": "README.md, docs, Makefile",
+    "test_docs_site.py": "the site of `make docs-site`, also in a real browser",
     "test_end_to_end.py": "the daemon as a process, with its clients",
     "test_report.py": "docs/generate/report.py and docs/measurements",
     "test_example_package.py": "docs/drivers.md and packages with drivers, outputs and simulators",
