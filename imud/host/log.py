@@ -295,7 +295,9 @@ def messages_dropped() -> int:
 
 def _log_unraisable(error: Any) -> None:
     """Log an exception without a caller. Python's own hook writes to standard error, which may block."""
-    log.error("exception ignored in %s", shown(error.object), exc_info=error.exc_value)
+    # since Python 3.14, err_msg contains the object
+    text = error.err_msg or "Exception ignored in"
+    log.error("%s", text if error.object is None else f"{text} {shown(error.object)}", exc_info=error.exc_value)
 
 
 def _log_thread_error(error: Any) -> None:

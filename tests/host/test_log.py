@@ -288,6 +288,6 @@ def test_a_file_receives_messages_and_reports_of_python(tmp_path: Path, monkeypa
     text = (tmp_path / "log").read_text()
     assert "ERROR thread worker ended by an exception" in text
     assert "KeyError: 'missing'" in text
-    assert re.search(r"ERROR exception ignored in <function \S*Unclosable\.__del__", text)
+    assert re.search(r"ERROR Exception ignored (in|while calling deallocator) <function \S*Unclosable\.__del__", text)
     assert "KeyError: 'not closed'" in text
     assert "DeprecationWarning: out of date" in text
