@@ -76,7 +76,7 @@ class CanSimulator:
 
 
 class FrameWire:
-    """The wire of a CAN bus. It sends the frames of one device one after the other at the bit rate."""
+    """The wire of a CAN bus. It sends the frames of a device in sequence at the bit rate."""
 
     def __init__(self, bitrate: int, free_ns: int) -> None:
         """`bitrate` 0: frames take no time, so that frames of one instant leave together. The wire is busy until
