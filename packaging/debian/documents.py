@@ -10,6 +10,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 LINK = re.compile(r"\]\(([^):#]+)(?:#[^)]*)?\)")  # target inside the repository, without its anchor
+CODE = re.compile(r"^ *```.*?^ *```|`[^`\n]*`", re.MULTILINE | re.DOTALL)  # can look like a link: `MOTIONS[name](9.8)`
 
 
 def reached(file: Path, found: set[Path]) -> set[Path]:
@@ -20,7 +21,7 @@ def reached(file: Path, found: set[Path]) -> set[Path]:
         raise SystemExit(f"documents.py: expected the target of a link, got no file {file}")
     found.add(file)
     if file.suffix == ".md":
-        for target in LINK.findall(file.read_text()):
+        for target in LINK.findall(CODE.sub("", file.read_text())):
             reached((file.parent / target).resolve(), found)
     return found
 

@@ -9,7 +9,7 @@ import pytest
 
 from tests.support.daemon_process import LIMIT_S
 from tests.support.files import ROOT
-from tests.test_docs import ANCHOR_LINK, LINK, anchors
+from tests.test_docs import ANCHOR_LINK, LINK, anchors, prose
 
 pytestmark = pytest.mark.live
 
@@ -43,9 +43,9 @@ def test_the_package_contains_each_page_that_texts_and_links_name(tmp_path: Path
     pages = {file.relative_to(tmp_path).as_posix() for file in tmp_path.rglob("*.md")}
     assert {f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")} | {"README.md"} <= pages
     for file in map(tmp_path.joinpath, pages):
-        for target in LINK.findall(file.read_text()):
+        for target in LINK.findall(prose(file)):
             assert "://" in target or (file.parent / target).is_file(), f"{file.name}: {target}"
-        for target, anchor in ANCHOR_LINK.findall(file.read_text()):
+        for target, anchor in ANCHOR_LINK.findall(prose(file)):
             page = file.parent / target if target else file
             assert page.suffix != ".md" or anchor in anchors(page), f"{file.name}: {target}#{anchor}"
     references = [(path, *found) for path in TEXTS for found in PAGE.findall(path.read_text())]
