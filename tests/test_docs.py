@@ -27,10 +27,8 @@ from tests.support.daemon_process import LIMIT_S, daemon_with_module, sending_da
 from tests.support.files import ROOT, hi91
 
 FIRST_PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md")]
-PAGES = [*FIRST_PAGES, *sorted((ROOT / "docs").glob("*.md"))]
-FENCE = re.compile(r"^ *```(\w*)\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
 PAGES = [*FIRST_PAGES, *sorted((ROOT / "docs").rglob("*.md"))]
-FENCE = re.compile(r"^ *```(\w+)\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
+FENCE = re.compile(r"^ *```(\w*)\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)")
 ANCHOR_LINK = re.compile(r"\]\(([^)#:]*)#([^)]+)\)")
 
@@ -42,17 +40,33 @@ NETWORK = "needs a package index, a broker, a database or another host"
 NOT_RUN = {
     **dict.fromkeys(("apt", "apt-get", "dpkg-query", "usermod", "systemctl", "systemd-sysusers", "udevadm"), HOST),
     **dict.fromkeys(("journalctl", "systemd-analyze", "sudoedit", "nano", "modprobe", "ip", "stty", "candump"), HOST),
-    **dict.fromkeys(("gpspipe", "timeout"), HOST),
-    **dict.fromkeys(("pipx", "curl", "ssh", "nc", "socat", "mosquitto_passwd", "ros2"), NETWORK),
+    **dict.fromkeys(("gpspipe", "timeout", "systemd-tmpfiles", "groupadd"), HOST),
+    **dict.fromkeys(("podman", "podman-compose"), "packaging/image/try"),
+    **dict.fromkeys(("gpg", "packaging/release"), "tests/packaging, with a key and commands of the tests"),
+    **dict.fromkeys(("pipx", "curl", "rsync", "ssh", "nc", "socat", "mosquitto_passwd", "ros2"), NETWORK),
     **dict.fromkeys((".", "export", "echo", "printf", "base64", "openssl", "grep"), "a tool of the shell"),
-    **dict.fromkeys(("cp", "rm", "ln", "install", "tar"), "a tool of the shell; `bash -n` checks its syntax"),
+    **dict.fromkeys(("cp", "rm", "ln", "install", "mkdir"), "a tool of the shell; `bash -n` checks its syntax"),
+    **dict.fromkeys(("tar", "tee", "stat"), "a tool of the shell; `bash -n` checks its syntax"),
+    "python": "tests/stability/test_stability.py",
     "cc": "test_examples_read_from_a_running_daemon",
     "./reader": "test_examples_read_from_a_running_daemon",
+    "sh": "tests/packaging/test_apt.py",
     "promtool": "tests/monitoring/test_rules.py", "amtool": "tests/monitoring/test_rules.py",
 }  # fmt: skip
 """Programs of shell examples that no test of this module starts or parses, with the reason or the test."""
 
-CHECKED_HERE = ("sh", "yaml", "console", "ini", "c", "text", "python README.md", "python reader.md")
+CHECKED_HERE = (
+    "sh",
+    "yaml",
+    "console",
+    "ini",
+    "c",
+    "text",
+    "python README.md",
+    "python reader.md",
+    "python python.md",
+    "python simulators.md",
+)
 """Languages, or languages and pages, that this module or `test_example_package.py` (drivers.md) checks.
 
 `text` is output, or a file of another program.
@@ -71,6 +85,7 @@ TESTED_ELSEWHERE = {
     "json fleet.md": "tests/fleet/test_commands.py",
     "acl fleet.md": "tests/fleet/test_commands.py",
     "python drivers.md": "tests/test_example_package.py",
+    "yaml release": "tests/packaging/test_release.py",
     "toml drivers.md": "tests/test_example_package.py",
 }
 """Examples by language and page, or by language and file name, with the module that tests them."""

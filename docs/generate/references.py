@@ -399,6 +399,8 @@ def versions() -> str:
 
     rows = [f"| [{name}](#{name}) | {one.version} | {one.read} |" for name, one in INTERFACES.items()]
     return "\n".join(["| interface | version | a program reads it from |", "|---|---|---|", *rows])
+
+
 # --- docs/simulators.md -----------------------------------------------------------------------------------------------
 
 

@@ -3,6 +3,7 @@
 import ast
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from importlib import import_module
 from itertools import chain
 from pathlib import Path
@@ -84,8 +85,7 @@ def module_facts(name: str) -> Facts:
     listed = getattr(module, "__all__", None)
     if listed is None:
         return _facts_of(_definitions(name), name)
-    homes = {one: getattr(getattr(module, one), "__module__", name) for one in listed}
-    return dict(chain.from_iterable(name_facts(home, one, name).items() for one, home in homes.items()))
+    return dict(chain.from_iterable(name_facts(_home(name, one), one, name).items() for one in listed))
 
 
 def name_facts(module: str, name: str, prefix: str = "") -> Facts:
@@ -112,10 +112,28 @@ def _is_store(node: ast.AST) -> TypeGuard[ast.Subscript]:
     return isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Store)
 
 
-def _definitions(module: str) -> dict[str, ast.stmt]:
+def _home(module: str, name: str) -> str:
+    """Return the module that defines a name of `module`."""
+    if name in _definitions(module):
+        return module
+    sources = [node.module for node in _body(module) if isinstance(node, ast.ImportFrom) and _has(node, name)]
+    # a module that imports its names later has no such line
+    return _home(str(sources[0]), name) if sources else str(getattr(import_module(module), name).__module__)
+
+
+def _has(node: ast.ImportFrom, name: str) -> bool:
+    return any(alias.name == name for alias in node.names)
+
+
+@cache
+def _body(module: str) -> list[ast.stmt]:
     file = sys.modules[import_module(module).__name__].__file__
     assert file is not None
-    return {name: node for node in ast.parse(Path(file).read_text()).body for name in _names(node)}
+    return ast.parse(Path(file).read_text()).body
+
+
+def _definitions(module: str) -> dict[str, ast.stmt]:
+    return {name: node for node in _body(module) for name in _names(node)}
 
 
 def _names(node: ast.stmt) -> list[str]:
