@@ -271,6 +271,8 @@ EXTREMES: list[Any] = [
 ]  # fmt: skip
 
 
+# The kernel is compiled with headers that count. CPython restores the count of None if it reaches 0 (none_dealloc).
+@pytest.mark.skipif(sys.version_info >= (3, 12), reason="None is immortal since Python 3.12, its count may change")
 def test_none_keeps_its_references() -> None:
     """Python 3.11 counts them, also if the headers of a later Python compiled the kernel."""
     module, before = kernel.present.module, sys.getrefcount(None)
