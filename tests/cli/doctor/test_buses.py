@@ -227,7 +227,8 @@ def test_documents_set_restart_ms_while_the_interface_is_down() -> None:
         commands = re.findall(r"^.*?type can .*?restart-ms", (ROOT / file).read_text(), re.MULTILINE)
         assert commands, file
         for command in commands:
-            assert re.search(r"\bdown\b.* up type|pre-up ip|^(sudo )?ip link set can0 type can bitrate", command), command
+            pattern = r"\bdown\b.* up type|pre-up ip|^(sudo )?ip link set can0 type can bitrate"
+            assert re.search(pattern, command), command
 
 
 def test_bit_rates(mast: Machine) -> None:
