@@ -24,7 +24,7 @@ wheels:
 apt-repository:
 	mkdir -p build/apt/dists/trixie build/apt/pool/trixie
 	echo signed >build/apt/dists/trixie/InRelease
-	for arch in $(ARCH) riscv64; do echo deb >build/apt/pool/trixie/imud-daemon_1.2.3-1~trixie_$$arch.deb; done
+	for arch in $(ARCH); do echo deb >build/apt/pool/trixie/imud-daemon_1.2.3-1~trixie_$$arch.deb; done
 image-try:
 	mkdir -p build/image
 	echo image >build/image/imud-1.2.3-$(ARCH).tar
@@ -87,7 +87,6 @@ def test_a_release_is_built_verified_and_published(tree: Path) -> None:
     assert (tree / "build/release/SHA256SUMS.asc").exists()
     report = (tree / "build/release/report.txt").read_text()
     assert "gate: passed" in report
-    assert "without binfmt for the architecture: imud-daemon_1.2.3-1~trixie_riscv64.deb" in report
     for part in ("wheels: verified", "apt: verified imud-daemon_1.2.3", "image: verified"):
         assert part in report
     commands = {f"PUBLISH_{name}": f"cp -r . {tree}/build/public-{name}" for name in ("WHEELS", "SUMS")}
@@ -129,6 +128,11 @@ def test_a_commit_after_the_tag_is_not_released(tree: Path) -> None:
         (".ci/test-wheels", "exit 1", ALL),
         ("packaging/apt/try", "exit 1", "apt image"),
         ("build/bin/gpg", "echo VALIDSIG CD34", "apt image"),
+        (
+            "Makefile",
+            MAKEFILE.replace("in $(ARCH)", "in $(ARCH) riscv64"),
+            "apt image",
+        ),  # a package that cannot run here
         ("packaging/image/try", "exit 1", "image"),
         ("Makefile", MAKEFILE.replace("image-try:", "picture:"), "image"),
         ("packaging/image/try", "touch new.txt", ""),
