@@ -16,15 +16,18 @@ import tty
 import msgspec
 
 from imud.drivers.hipnuc.uart.codec import encode_hi91  # noqa: F401 - same start-up cost as imud
+from imud.formats.slot import SLOT_BYTES
+from tests.bench.readers import LENGTH
 
 HEAD = struct.Struct("<2sHH")  # HiPNUC header: sync, length, CRC
 BODY = struct.Struct("<BHbfI16f")  # payload of an HI91 frame
-OUT = struct.Struct("<IQqqqqQIIIHBx3d3d3d4d3d2d2d32x")  # length prefix and slot of imud's binary encoding
+VALUES = "<IQqqqqQIIIHBx3d3d3d4d3d2d2d"  # length prefix and values of a slot of imud's binary encoding
+OUT = struct.Struct(f"{VALUES}{LENGTH.size + SLOT_BYTES - struct.calcsize(VALUES)}x")
 JSON = msgspec.json.Encoder()
 
 
 def binary(device: int, seq: int, now_ns: int, v: tuple[float, ...]) -> bytes:
-    return OUT.pack(256, seq, now_ns, now_ns, now_ns, 0, 0, 0, 0, 0, device, 0, *v[5:21], v[2], v[3], 0.0, 0.0)
+    return OUT.pack(SLOT_BYTES, seq, now_ns, now_ns, now_ns, 0, 0, 0, 0, 0, device, 0, *v[5:21], v[2], v[3], 0.0, 0.0)
 
 
 def as_json(device: int, seq: int, now_ns: int, v: tuple[float, ...]) -> bytes:

@@ -202,6 +202,8 @@ def run(load: Load) -> Outcome:
         statuses = () if load.bare else tuple(ask(folder / "s"))
         readers.say("end")
         figures = json.loads(readers.line())
+        if load.clients and not figures["samples"]:
+            raise RuntimeError("expected samples at the first client, got none")
     # device n starts n * apart frames later and sends fewer frames
     total = load.frames * load.devices - load.apart * sum(range(load.devices))
     counted = used.elapsed_s * load.rate_hz * load.devices
