@@ -1,0 +1,1 @@
+"""PostgreSQL database of a fleet: tables, rows, transactions, and removal of old rows."""
