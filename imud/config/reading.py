@@ -19,7 +19,7 @@ from imud.config.parts import (
     read_lines,
     read_rmc,
 )
-from imud.config.schema import TABLES, DeviceGeneral, General, Keys, Tables
+from imud.config.schema import TABLES, DeviceGeneral, General, Keys, S, Tables
 from imud.config.yaml import FILE_BYTES_MAX, Problem, no_pause, path_text, read_yaml
 from imud.config.yaml import Path as KeyPath
 from imud.contracts.command import Target
@@ -37,25 +37,40 @@ from imud.model.sample import DEVICE_NAME_PATTERN
 from imud.model.units import NS_PER_S, NS_PER_US
 
 PROBLEMS_SHOWN: Final = 20
+MISSING: Final = "is the path right?"  # hint if a file does not exist
 
 
 def load(
     path: Path | str,
     tables: Tables = TABLES,
     pause: Callable[[], None] = no_pause,
-    missing: str = "is the path right?",
+    missing: str = MISSING,
 ) -> Config:
     """Read a configuration file. Raises ConfigError with all problems, one per line.
 
     imud calls `pause` after each piece of work of less than a millisecond. `missing` is the hint if the file does not
     exist.
     """
+    return parse(_content(path, missing), str(path), tables, pause)
+
+
+def load_options(path: Path | str, schema: type[S]) -> S:
+    """Read a YAML file that contains only the keys of `schema`. Raises ConfigError with all problems, one per line."""
+    tree = read_yaml(_content(path, MISSING))
+    keys = Keys(tree)
+    options = keys.part(schema, tree.data, ()) if tree.complete else None
+    problems = [*tree.problems, *keys.problems_besides(tree.problems)]
+    if problems or options is None:
+        raise ConfigError(_report(problems, str(path)))
+    return options
+
+
+def _content(path: Path | str, missing: str) -> bytes:
     try:
-        content = read_regular(path, FILE_BYTES_MAX + 1)
+        return read_regular(path, FILE_BYTES_MAX + 1)
     except OSError as error:
         hint = "check its owner and mode" if isinstance(error, PermissionError) else missing
         raise ConfigError(f"cannot read {path}: {error.strerror}; {hint}") from None
-    return parse(content, str(path), tables, pause)
 
 
 def parse(text: str | bytes, filename: str, tables: Tables = TABLES, pause: Callable[[], None] = no_pause) -> Config:
