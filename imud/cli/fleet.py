@@ -5,19 +5,21 @@ import asyncio
 import signal
 import sys
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, suppress
 from time import monotonic_ns, time_ns
 from typing import Final, Protocol
 
 from imud.cli.arguments import CliCommand, add_duration
 from imud.cli.output import complain, table
+from imud.config import load_options
 from imud.fleet.accounts import GatewayState, StreamAccount, StreamKey
 from imud.fleet.broker import ReaderAccess
-from imud.fleet.collector import GC_ALLOCATIONS, FleetCollector, FleetStore, JsonLines, Selection
+from imud.fleet.collector import GC_ALLOCATIONS, FleetCollector, FleetStore, JsonLines, LedgerStore, Selection
+from imud.fleet.database.settings import CollectorSettings
+from imud.fleet.database.store import PostgresStore
 from imud.fleet.influx import InfluxStore
 from imud.fleet.messages import GatewayClock, Stream
-from imud.fleet.postgres import PostgresStore
 from imud.fleet.reader import VERSIONS, Fleet, FleetBatch
 from imud.host.http_post import HttpPost, PostAccess, post_url
 from imud.host.installation import needs_extra
@@ -247,6 +249,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="count samples as missing that a gateway sent since its boot, before the collector received its first "
         "message",
     )  # fmt: skip
+    collecting.add_argument(
+        "--config", metavar="FILE", help="for a postgresql URL: settings of the collector and its database (YAML)"
+    )
     showing = actions.add_parser("top", help="show all gateways in a full-screen view of the terminal")
     _broker(showing)
     add_top(showing)
@@ -293,7 +298,7 @@ def fleet_of(args: argparse.Namespace, name: str, *, from_begin: bool) -> Fleet:
 
 async def _collect(args: argparse.Namespace) -> int:
     fleet = fleet_of(args, args.name, from_begin=args.from_begin)
-    store = store_of(args.to, PostAccess(args.to_token_file, args.to_ca_file))
+    store = store_of(args, fleet)
     collector = FleetCollector(fleet, store, Selection(args.site, args.gateway, args.device))
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, collector.stop)
@@ -301,12 +306,10 @@ async def _collect(args: argparse.Namespace) -> int:
         # collections would take a large share of the CPU time at high rates
         with rare_garbage_collection(GC_ALLOCATIONS):
             await collector.run(stop_after_s=args.duration)
+        for line in _results(fleet, store):
+            print(line, file=sys.stderr)
     finally:
         store.close()
-    if ledger := account_table(fleet.accounts):
-        print(ledger, file=sys.stderr)
-    if isinstance(store, InfluxStore) and store.refused:
-        print(f"the server rejected {store.refused} messages; the log has the reasons", file=sys.stderr)
     if fleet.ignored:
         print(f"{fleet.ignored} messages were invalid and not stored; the log names them", file=sys.stderr)
     if fleet.problem:
@@ -314,17 +317,31 @@ async def _collect(args: argparse.Namespace) -> int:
     return 1 if fleet.problem else 0
 
 
-def store_of(text: str, access: PostAccess = OPEN) -> FleetStore:
-    """Open the store of `--to`. `access` is for a store with an HTTP URL. Raises BadArgument, ServerError."""
-    url = post_url(text)
+def _results(fleet: Fleet, store: FleetStore) -> Iterator[str]:
+    """Yield the ledger and the rejected messages at the end of `collect`."""
+    if isinstance(store, PostgresStore):
+        yield store.ledger_text()
+    elif ledger := account_table(fleet.accounts):
+        yield ledger
+    if isinstance(store, LedgerStore) and isinstance(store.to, InfluxStore) and store.to.refused:
+        yield f"the server rejected {store.to.refused} messages; the log has the reasons"
+
+
+def store_of(args: argparse.Namespace, fleet: Fleet) -> FleetStore:
+    """Open the store of `--to`. Raises BadArgument, ConfigError, ServerError."""
+    url, access = post_url(args.to), PostAccess(args.to_token_file, args.to_ca_file)
+    is_postgres = args.to.startswith(("postgresql://", "postgres://"))
+    if args.config is not None and not is_postgres:
+        raise BadArgument("--config: expected --to with a postgresql URL")
     if url is not None:
-        return InfluxStore(HttpPost(url, access))
+        return LedgerStore(fleet, InfluxStore(HttpPost(url, access)))
     if access != OPEN:
         raise BadArgument("--to-token-file, --to-ca-file: expected --to with an http or https URL")
-    if text == "-":
-        return JsonLines(sys.stdout)
-    if text.startswith(("postgresql://", "postgres://")):
-        return PostgresStore(text)
+    if args.to == "-":
+        return LedgerStore(fleet, JsonLines(sys.stdout))
+    if is_postgres:
+        settings = CollectorSettings() if args.config is None else load_options(args.config, CollectorSettings)
+        return PostgresStore(args.to, settings, from_begin=args.from_begin)
     raise BadArgument(
         "--to: expected - for standard output, a URL like postgresql://USER@HOST/DATABASE, or a write URL like "
         "http://HOST:8086/write?db=imud without user, password and token"

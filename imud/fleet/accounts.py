@@ -8,7 +8,7 @@ The numbers of a stream arrive in order. A gateway can send a message again, alo
 
 from collections.abc import Mapping, Sequence
 from itertools import islice
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Self
 
 import msgspec
 
@@ -63,28 +63,31 @@ class StreamCounts(msgspec.Struct):
         return self.newest - self.begin + 1 - covered
 
 
-class StoredAccount(msgspec.Struct, frozen=True):
-    """Ledger of one stream as a store keeps it. A reader continues with it after a restart."""
-
-    counts: StreamCounts
-    gaps: list[tuple[int, int]]  # first and last number of each gap that a later message can fill
-
-
-Accounts = Mapping[StreamKey, StoredAccount | None]  # ledgers by stream; None: the stream left the ledger
-
-
-class _Account:
+class StreamLedger:
     """Ledger of one stream with its gaps."""
 
     def __init__(self, counts: StreamCounts, gaps: Sequence[tuple[int, int]] = ()) -> None:
         self.counts = counts
-        self._gaps = list(gaps)
+        self.gaps = list(gaps)  # first and last number of each gap that a later message can fill
 
-    def stored(self) -> StoredAccount:
-        """Return a copy of the present state."""
-        return StoredAccount(msgspec.structs.replace(self.counts, dropped=dict(self.counts.dropped)), list(self._gaps))
+    @classmethod
+    def before(cls, message: FleetMessage, *, from_begin: bool) -> Self:
+        """Return an empty ledger for the first message of a stream. With `from_begin`, earlier numbers are missing."""
+        begin = message.begin if from_begin else message.first
+        return cls(StreamCounts(begin, begin - 1))
 
-    def take(self, message: FleetMessage, stream: Stream) -> list[tuple[int, int]]:
+    def take(self, message: FleetMessage, stream: Stream) -> FleetMessage | None:
+        """Add a message. Return its new part, None for a duplicate. If only a part of a message with statistics is new,
+        return the complete message."""
+        fresh = self._fresh(message, stream)
+        if not fresh:
+            return None
+        if fresh == [(message.first, message.last)] or not message.samples:
+            return message
+        samples = [one for one in message.samples if any(first <= one.seq <= last for first, last in fresh)]
+        return msgspec.structs.replace(message, samples=samples)
+
+    def _fresh(self, message: FleetMessage, stream: Stream) -> list[tuple[int, int]]:
         """Add a message. Return the ranges of new numbers."""
         counts = self.counts
         fresh = self._filled(message.first, min(message.last, counts.newest))
@@ -92,9 +95,9 @@ class _Account:
             # a gap before the message
             first = max(message.first, counts.newest + 1)
             if first > counts.newest + 1:
-                self._gaps.append((counts.newest + 1, first - 1))
+                self.gaps.append((counts.newest + 1, first - 1))
                 counts.missing += first - 1 - counts.newest
-                del self._gaps[:-RANGES_MAX]
+                del self.gaps[:-RANGES_MAX]
             fresh.append((first, message.last))
             counts.newest = message.last
         number = sum([last - first + 1 for first, last in fresh])
@@ -112,7 +115,7 @@ class _Account:
     def _filled(self, first: int, last: int) -> list[tuple[int, int]]:
         """Remove a range from the gaps. Return the removed parts."""
         found, left = [], []
-        for begin, end in self._gaps:
+        for begin, end in self.gaps:
             low, high = max(begin, first), min(end, last)
             if low > high:
                 left.append((begin, end))
@@ -120,7 +123,7 @@ class _Account:
             found.append((low, high))
             self.counts.missing -= high - low + 1
             left += [one for one in ((begin, low - 1), (high + 1, end)) if one[0] <= one[1]]
-        self._gaps = left
+        self.gaps = left
         return found
 
 
@@ -162,7 +165,7 @@ class FleetLedger:
     def __init__(self, *, from_begin: bool = False) -> None:
         """Create an empty ledger. With `from_begin`, numbers before the first received message count as missing."""
         self._from_begin = from_begin
-        self._accounts: dict[StreamKey, _Account] = {}
+        self._accounts: dict[StreamKey, StreamLedger] = {}
         self._recent = RecentStreams(STREAMS_MAX)
 
     @property
@@ -170,43 +173,15 @@ class FleetLedger:
         """Return the counters of each stream."""
         return {key: account.counts for key, account in self._accounts.items()}
 
-    def stored(self, key: StreamKey) -> StoredAccount | None:
-        """Return the ledger of a stream for a store; None if the ledger does not contain the stream."""
-        account = self._accounts.get(key)
-        return account.stored() if account is not None else None
-
-    def restore(self, key: StreamKey, account: StoredAccount) -> None:
-        """Continue with a stored ledger."""
-        self._accounts[key] = _Account(account.counts, account.gaps)
-        self._use(key)
-
-    def _use(self, key: StreamKey) -> list[StreamKey]:
-        """Make a stream the newest. Return the streams that left the ledger."""
-        removed = self._recent.use(key)
-        for one in removed:
-            self._accounts.pop(one, None)
-        return removed
-
-    def take(
-        self, message: FleetMessage, stream: Stream, changed: set[StreamKey] | None = None
-    ) -> FleetMessage | None:  # fmt: skip
-        """Add a message. Return its new part, None for a duplicate. Add the changed and the removed streams to
-        `changed`. If only a part of a message with statistics is new, return the complete message."""
+    def take(self, message: FleetMessage, stream: Stream) -> FleetMessage | None:
+        """Add a message. Return its new part, see `StreamLedger.take`."""
         key = key_of(message, stream)
-        removed = self._use(key)
-        if changed is not None:
-            changed.update((key, *removed))
+        for one in self._recent.use(key):
+            self._accounts.pop(one, None)
         account = self._accounts.get(key)
         if account is None:
-            begin = message.begin if self._from_begin else message.first
-            account = self._accounts[key] = _Account(StreamCounts(begin, begin - 1))
-        fresh = account.take(message, stream)
-        if not fresh:
-            return None
-        if fresh == [(message.first, message.last)] or not message.samples:
-            return message
-        samples = [one for one in message.samples if any(first <= one.seq <= last for first, last in fresh)]
-        return msgspec.structs.replace(message, samples=samples)
+            account = self._accounts[key] = StreamLedger.before(message, from_begin=self._from_begin)
+        return account.take(message, stream)
 
 
 # Maximum number of streams in the states of all gateways
@@ -354,7 +329,7 @@ def boot_of(message: FleetMessage) -> BootKey:
 def offset_of(message: FleetMessage) -> BootOffset | None:
     """Return the clock offset in a message; None if the clock is not set."""
     if message.clock is not None:
-        return _offset(message.clock)
+        return clock_offset(message.clock)
     pairs = [(one.t_ns, one.utc_ns) for one in message.samples[-1:]]
     pairs += [(one.begin_t_ns, one.begin_utc_ns) for one in message.intervals[-1:]]
     for t_ns, utc_ns in pairs:
@@ -400,7 +375,7 @@ class BootClocks:
     def take_state(self, gateway: str, state: GatewayState) -> None:
         """Store the clock offset of a state."""
         if state.clock is not None:
-            self._note(BootKey(gateway, state.boot), _offset(state.clock))
+            self._note(BootKey(gateway, state.boot), clock_offset(state.clock))
 
     def take_fresh(self) -> Mapping[BootKey, BootOffset]:
         """Return the first offsets of boots since the last call."""
@@ -420,5 +395,6 @@ class BootClocks:
         self._known[key] = offset
 
 
-def _offset(clock: GatewayClock) -> BootOffset | None:
+def clock_offset(clock: GatewayClock) -> BootOffset | None:
+    """Return the offset of a wall clock; None if the clock is not set."""
     return BootOffset(clock.t_ns, clock.utc_offset_ns, clock.error_ns) if clock.synchronised else None

@@ -1,10 +1,11 @@
-"""Collector: writes the batches of all gateways into a store and acknowledges them after the write.
+"""Collector: writes the messages of all gateways into a store and acknowledges them after the write.
 
-    session ──delivery──▶ ledger ──batch──▶ store.write (one transaction, in a thread) ──▶ acknowledge
+    session ──deliveries──▶ store.write (one transaction with the ledger, in a thread) ──▶ acknowledge
 
 A transaction contains the messages of COMMIT_S, at most BATCHES_MAX messages or TURN_BYTES. imud receives the next
-messages during the write. A store can keep the ledger, so that a collector recognizes duplicates after a restart. A
-collector ends if its store fails. The broker sends messages without an acknowledgement to the next collector.
+messages during the write. The store decides where the ledger is: a database contains its ledger, so that any collector
+recognizes duplicates. For other stores, `LedgerStore` keeps the ledger in memory. A collector ends if its store fails.
+The broker sends messages without an acknowledgement to the next collector.
 """
 
 import asyncio
@@ -13,7 +14,7 @@ from typing import Final, NamedTuple, Protocol, TextIO
 
 import msgspec
 
-from imud.fleet.accounts import Accounts, BootKey, BootOffset, FleetLedger, PlacedTime, StreamKey
+from imud.fleet.accounts import BootKey, BootOffset, PlacedTime
 from imud.fleet.messages import Interval, MessageKind
 from imud.fleet.reader import RECEIVE_MAX, Fleet, FleetBatch, FleetDelivery, FleetSession
 from imud.model.units import NS_PER_S
@@ -32,15 +33,10 @@ Offsets = Mapping[BootKey, BootOffset]  # clock offsets of boots whose clock is 
 
 
 class FleetStore(Protocol):
-    """Destination of the batches. Synchronization: one thread at a time."""
+    """Destination of the messages. Synchronization: one thread at a time."""
 
-    def restore(self, ledger: FleetLedger) -> None:
-        """Add the stored ledgers to `ledger`. Raises ServerError."""
-        ...
-
-    def write(self, batches: Sequence[FleetBatch], accounts: Accounts, offsets: Offsets) -> None:
-        """Store batches, changed ledgers and clock offsets in one transaction. Remove the ledgers that are None. Raises
-        ServerError or OSError. Records without UTC time of a boot in `offsets` get their UTC time."""
+    def write(self, deliveries: Sequence[FleetDelivery]) -> None:
+        """Store messages. The sequence can be empty. Raises ServerError or OSError."""
         ...
 
     def close(self) -> None:
@@ -48,13 +44,34 @@ class FleetStore(Protocol):
         ...
 
 
-class _Turn(NamedTuple):
-    """Content of one transaction."""
+class BatchStore(Protocol):
+    """Destination without a ledger. Synchronization: one thread at a time."""
 
-    deliveries: list[FleetDelivery]
-    batches: list[FleetBatch]
-    accounts: Accounts
-    offsets: Offsets
+    def write(self, batches: Sequence[FleetBatch], offsets: Offsets) -> None:
+        """Store batches, then new clock offsets. Raises ServerError or OSError."""
+        ...
+
+    def close(self) -> None:
+        """Close the store. A second call does nothing."""
+        ...
+
+
+class LedgerStore:
+    """Store that keeps the ledger in the memory of a reader. Synchronization: see `FleetStore`."""
+
+    def __init__(self, fleet: Fleet, to: BatchStore) -> None:
+        self._fleet, self.to = fleet, to
+
+    def write(self, deliveries: Sequence[FleetDelivery]) -> None:
+        """Add messages to the ledger and write their new parts. Raises ServerError or OSError."""
+        batches = [batch for one in deliveries if (batch := self._fleet.take(one)) is not None]
+        offsets = self._fleet.clocks.take_fresh()
+        if batches or offsets:
+            self.to.write(batches, offsets)
+
+    def close(self) -> None:
+        """Close the destination. A second call does nothing."""
+        self.to.close()
 
 
 class Selection(NamedTuple):
@@ -74,7 +91,6 @@ class FleetCollector:
     def __init__(
         self, fleet: Fleet, store: FleetStore, selection: Selection = EVERYTHING,
     ) -> None:  # fmt: skip
-        self.written = 0  # number of stored messages
         self._fleet, self._store, self._selection, self._now_ns = fleet, store, selection, fleet.now_ns
         self._stopped = False
 
@@ -84,7 +100,6 @@ class FleetCollector:
 
     async def run(self, *, stop_after_s: float | None = None) -> None:
         """Collect until `stop`, or for `stop_after_s`. Raises ServerError or OSError if the store fails."""
-        self._store.restore(self._fleet.ledger)
         end_ns = None if stop_after_s is None else self._now_ns() + round(stop_after_s * NS_PER_S)
         site, gateway, device = self._selection
         async with FleetSession(self._fleet, site=site, gateway=gateway, device=device) as session:
@@ -100,34 +115,25 @@ class FleetCollector:
                 if writing is not None:
                     await writing
 
-    async def _take(self, session: FleetSession) -> _Turn:
+    async def _take(self, session: FleetSession) -> list[FleetDelivery]:
         """Receive messages for COMMIT_S."""
-        turn = _Turn([], [], {}, {})
-        changed: set[StreamKey] = set()
+        turn: list[FleetDelivery] = []
         due_ns = self._now_ns() + round(COMMIT_S * NS_PER_S)
         size = 0
-        while len(turn.deliveries) < BATCHES_MAX and size < TURN_BYTES and not self._stopped:
+        while len(turn) < BATCHES_MAX and size < TURN_BYTES and not self._stopped:
             left_ns = due_ns - self._now_ns()
             if left_ns <= 0:
                 break
             delivery = await session.next(left_ns / NS_PER_S)
-            if delivery is None:
-                continue
-            size += len(delivery.payload)
-            turn.deliveries.append(delivery)
-            batch = self._fleet.take(delivery, changed)
-            # None for a state, or a message with duplicates only
-            if batch is not None:
-                turn.batches.append(batch)
-        accounts = {key: self._fleet.ledger.stored(key) for key in sorted(changed)}
-        return turn._replace(accounts=accounts, offsets=self._fleet.clocks.take_fresh())
+            if delivery is not None:
+                size += len(delivery.payload)
+                turn.append(delivery)
+        return turn
 
-    async def _write(self, session: FleetSession, turn: _Turn) -> None:
+    async def _write(self, session: FleetSession, turn: Sequence[FleetDelivery]) -> None:
         """Store the messages of a turn and acknowledge them."""
-        if turn.batches or turn.accounts or turn.offsets:
-            await asyncio.to_thread(self._store.write, turn.batches, turn.accounts, turn.offsets)
-            self.written += len(turn.batches)
-        for delivery in turn.deliveries:
+        await asyncio.to_thread(self._store.write, turn)
+        for delivery in turn:
             session.acknowledge(delivery)
 
 
@@ -136,15 +142,12 @@ _ENCODER: Final = msgspec.json.Encoder()
 
 
 class JsonLines:
-    """Store that prints lines of JSON. Synchronization: see `FleetStore`."""
+    """Store that prints lines of JSON. Synchronization: see `BatchStore`."""
 
     def __init__(self, out: TextIO) -> None:
         self._out = out
 
-    def restore(self, ledger: FleetLedger) -> None:
-        """Do nothing: the output does not contain the ledger."""
-
-    def write(self, batches: Sequence[FleetBatch], _accounts: Accounts, offsets: Offsets) -> None:
+    def write(self, batches: Sequence[FleetBatch], offsets: Offsets) -> None:
         """Print all records of the batches, then new clock offsets. Raises OSError."""
         for batch in batches:
             for line in lines_of(batch):

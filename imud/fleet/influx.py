@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Final
 
-from imud.fleet.accounts import Accounts, FleetLedger, PlacedTime
+from imud.fleet.accounts import PlacedTime
 from imud.fleet.collector import Offsets
 from imud.fleet.messages import Interval, MessageKind
 from imud.fleet.reader import FleetBatch
@@ -37,10 +37,7 @@ class InfluxStore:
         self._post, self._sleep = post, sleep
         self.refused = 0  # number of messages with a line that the server could not store
 
-    def restore(self, ledger: FleetLedger) -> None:
-        """Do nothing: the store does not contain the ledger."""
-
-    def write(self, batches: Sequence[FleetBatch], _accounts: Accounts, offsets: Offsets) -> None:
+    def write(self, batches: Sequence[FleetBatch], offsets: Offsets) -> None:
         """Send all records, then new clock offsets. Raises ServerError if the server does not confirm them. If it
         rejects values, send each message in its own request and ignore the messages that it rejects."""
         clocks = "".join(clock_lines(offsets))

@@ -76,6 +76,18 @@ class FleetDelivery(NamedTuple):
     connection: "ReaderConnection"
 
 
+def decode_delivery(delivery: FleetDelivery) -> tuple[TopicParts, FleetMessage | GatewayState]:
+    """Return the topic and the content of a message of the session. Raises ValueError if the payload is invalid."""
+    parts = parse_topic(delivery.topic)
+    assert parts is not None  # FleetSession.next checks the topic
+    if parts.leaf == STATE:
+        return parts, decode_state(delivery.payload)
+    message = decode_message(delivery.payload)
+    if (message.gateway, message.device) != (parts.gateway, parts.device):
+        raise ValueError(f"expected a message of {parts.gateway}/{parts.device}, got a message of another device")
+    return parts, message
+
+
 class ReaderConnection:
     """Connection to one broker. `open` creates it. Synchronization: the event loop's thread."""
 
@@ -381,11 +393,17 @@ class Fleet:
         self.states: dict[tuple[str, str], GatewayState] = {}  # newest state of each gateway, by site and gateway
         self._states_bytes = 0
         self._state_bytes: dict[tuple[str, str], int] = {}  # length of each state, in the order of their arrival
-        self.ignored = 0  # number of messages that no gateway of a supported version sent
+        self.foreign = 0  # number of messages outside the selection
+        self._undecoded = 0
         self.connections = 0  # number of accepted connections
         self.problem = ""  # cause of a missing connection, one sentence; empty while the reader is connected
         self.clocks = BootClocks()  # clock offsets of the gateways
         self._positions = SpoolPositions(from_begin=from_begin)
+
+    @property
+    def ignored(self) -> int:
+        """Return the number of messages outside the selection or not from a gateway of a supported version."""
+        return self.foreign + self._undecoded
 
     @property
     def accounts(self) -> Mapping[StreamKey, StreamAccount]:
@@ -415,30 +433,23 @@ class Fleet:
                     yield batch
                 session.acknowledge(delivery)
 
-    def take(self, delivery: FleetDelivery, changed: set[StreamKey] | None = None) -> FleetBatch | None:
-        """Add a message to the ledger. Return its new part. This method adds the keys of changed and removed ledgers to
-        `changed`, also after a duplicate."""
-        parts = parse_topic(delivery.topic)
-        assert parts is not None  # FleetSession.next checks the topic
+    def take(self, delivery: FleetDelivery) -> FleetBatch | None:
+        """Add a message to the ledger. Return its new part."""
         try:
-            if parts.leaf == STATE:
-                state = decode_state(delivery.payload)
-                self._keep_state((parts.site, parts.gateway), state, len(delivery.payload))
-                self._positions.take(parts.gateway, state)
-                self.clocks.take_state(parts.gateway, state)
-                return None
-            message, stream = decode_message(delivery.payload), Stream(parts.leaf)
-            if (message.gateway, message.device) != (parts.gateway, parts.device):
-                raise ValueError(
-                    f"expected a message of {parts.gateway}/{parts.device}, got a message of another device"
-                )
-            fresh = self.ledger.take(message, stream, changed)
-            offset = self.clocks.take(message)
-            return FleetBatch(parts.site, stream, fresh, offset) if fresh is not None else None
+            parts, content = decode_delivery(delivery)
         except ValueError as error:
-            self.ignored += 1
+            self._undecoded += 1
             log.warning("%s: %s", delivery.topic, error)
             return None
+        if isinstance(content, GatewayState):
+            self._keep_state((parts.site, parts.gateway), content, len(delivery.payload))
+            self._positions.take(parts.gateway, content)
+            self.clocks.take_state(parts.gateway, content)
+            return None
+        stream = Stream(parts.leaf)
+        fresh = self.ledger.take(content, stream)
+        offset = self.clocks.take(content)
+        return FleetBatch(parts.site, stream, fresh, offset) if fresh is not None else None
 
     def _keep_state(self, key: tuple[str, str], state: GatewayState, size: int) -> None:
         """Store the newest state of a gateway. Forget the oldest states if all states are too large."""
@@ -488,7 +499,7 @@ class FleetSession:
             return None
         parts = parse_topic(delivery.topic)
         if parts is None or not self._is_wanted(parts):
-            fleet.ignored += 1  # the session still has the subscription of an earlier reader with the same name
+            fleet.foreign += 1  # the session still has the subscription of an earlier reader with the same name
             self.acknowledge(delivery)
             return None
         return delivery

@@ -11,14 +11,18 @@ import asyncio
 import json
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from threading import Lock
 from time import monotonic, time_ns
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
-from imud.fleet.accounts import Accounts, FleetLedger
-from imud.fleet.collector import GC_ALLOCATIONS, FleetCollector, Offsets
-from imud.fleet.postgres import PostgresStore
-from imud.fleet.reader import VERSIONS, Fleet, FleetBatch
+import msgspec
+
+from imud.fleet.accounts import StreamCounts
+from imud.fleet.collector import GC_ALLOCATIONS, FleetCollector, FleetStore, LedgerStore, Offsets
+from imud.fleet.database.store import PostgresStore
+from imud.fleet.messages import MAGIC
+from imud.fleet.reader import VERSIONS, Fleet, FleetBatch, FleetDelivery
 from imud.host.threads import rare_garbage_collection
 from imud.model.units import NS_PER_MS
 
@@ -26,26 +30,80 @@ END_S: Final = 180.0  # wait for the last samples
 LOOK_S: Final = 0.05  # interval of polls
 
 
+_PREFIX_BYTES: Final = 8  # of a message with slots, before its header
+
+
+class _Head(msgspec.Struct):
+    utc_ns: int
+
+
+_HEADS: Final = msgspec.json.Decoder(_Head)
+
+
 class MeasuredStore:
-    def __init__(self, to: PostgresStore | None) -> None:
-        self.came = 0
+    """Store that measures the delays of messages. It gives the messages to `to`."""
+
+    def __init__(self, to: FleetStore) -> None:
         self.delays_ms: list[float] = []
+        self.lock = Lock()  # held during a write
         self._to = to
 
-    def restore(self, ledger: FleetLedger) -> None:
-        if self._to is not None:
-            self._to.restore(ledger)
-
-    def write(self, batches: Sequence[FleetBatch], accounts: Accounts, offsets: Offsets) -> None:
-        if self._to is not None:
-            self._to.write(batches, accounts, offsets)
+    def write(self, deliveries: Sequence[FleetDelivery]) -> None:
+        with self.lock:
+            self._to.write(deliveries)
         now_ns = time_ns()
-        self.came += sum(one.message.count for one in batches)
-        self.delays_ms += [(now_ns - one.message.utc_ns) / NS_PER_MS for one in batches]
+        self.delays_ms += [(now_ns - _utc_ns(one.payload)) / NS_PER_MS for one in deliveries]
 
     def close(self) -> None:
-        if self._to is not None:
-            self._to.close()
+        self._to.close()
+
+
+def _utc_ns(payload: bytes) -> int:
+    if payload.startswith(MAGIC):
+        size = int.from_bytes(payload[_PREFIX_BYTES - 2 : _PREFIX_BYTES], "little")
+        payload = payload[_PREFIX_BYTES : _PREFIX_BYTES + size]
+    return _HEADS.decode(payload).utc_ns
+
+
+class Nothing:
+    """Destination of batches that does nothing."""
+
+    def write(self, batches: Sequence[FleetBatch], offsets: Offsets) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+class LedgerSums(NamedTuple):
+    """Sums over the ledgers of all streams."""
+
+    streams: int
+    came: int
+    missing: int
+    duplicates: int
+    open: int  # number of streams whose ledger does not balance
+
+
+def sums_of(counts: Collection[StreamCounts]) -> LedgerSums:
+    return LedgerSums(
+        len(counts), sum(one.whole + one.thinned for one in counts), sum(one.missing for one in counts),
+        sum(one.duplicates for one in counts), sum(one.balance != 0 for one in counts),
+    )  # fmt: skip
+
+
+def sums_in(url: str) -> LedgerSums:
+    """Return the sums of the ledger in a database."""
+    import psycopg
+
+    with psycopg.connect(url) as connection:
+        row = connection.execute(
+            "SELECT count(*), coalesce(sum(whole + thinned), 0)::bigint, coalesce(sum(missing), 0)::bigint, "
+            "coalesce(sum(duplicates), 0)::bigint, count(*) FILTER (WHERE newest - begin + 1 <> whole + thinned + "
+            "dropped + missing) FROM imud_ledger"
+        ).fetchone()
+    assert row is not None
+    return LedgerSums(*row)
 
 
 class CollectorProcess:
@@ -66,7 +124,7 @@ class CollectorProcess:
 async def collect(urls: Sequence[str], version: str, to: str) -> dict[str, Any]:
     """Collect until the number of samples from standard input has arrived. Return the counters."""
     fleet = Fleet(*urls, name="load", version=version, from_begin=True, retry_max_s=1.0)
-    store = MeasuredStore(PostgresStore(to) if to else None)
+    store = MeasuredStore(PostgresStore(to, from_begin=True) if to else LedgerStore(fleet, Nothing()))
     collector = FleetCollector(fleet, store)
     running = asyncio.ensure_future(collector.run())
     while not fleet.connections:
@@ -74,17 +132,22 @@ async def collect(urls: Sequence[str], version: str, to: str) -> dict[str, Any]:
     print("ready", flush=True)
     due = int(await asyncio.to_thread(sys.stdin.readline))
     end_s = monotonic() + END_S
+
+    def ledger() -> LedgerSums:
+        if to:
+            return sums_in(to)
+        with store.lock:  # the write changes the ledger
+            return sums_of(fleet.ledger.counts.values())
+
     # after END_S, return the counters although samples are missing: the caller reports the difference
-    while store.came < due and monotonic() < end_s and not running.done():
+    while ledger().came < due and monotonic() < end_s and not running.done():
         await asyncio.sleep(LOOK_S)
     collector.stop()
     await running
     store.close()
-    counts, delays_ms = fleet.ledger.counts.values(), sorted(store.delays_ms)
-    return {
-        "came": store.came, "missing": sum(one.missing for one in counts), "connects": fleet.connections,
-        "duplicates": sum(one.duplicates for one in counts), "streams": len(counts),
-        "open": sum(one.balance != 0 for one in counts), "p50_ms": delays_ms[len(delays_ms) // 2],
+    delays_ms = sorted(store.delays_ms)
+    return ledger()._asdict() | {
+        "connects": fleet.connections, "p50_ms": delays_ms[len(delays_ms) // 2],
         "p99_ms": delays_ms[len(delays_ms) * 99 // 100], "max_ms": delays_ms[-1],
     }  # fmt: skip
 

@@ -13,7 +13,7 @@ import msgspec
 import pytest
 
 from imud.fleet import accounts as fleet_accounts
-from imud.fleet.collector import FleetCollector, JsonLines, Offsets, lines_of
+from imud.fleet.collector import FleetCollector, JsonLines, LedgerStore, Offsets, lines_of
 from imud.fleet.messages import FleetMessage, GatewayClock, Stream, decode_message, encode_message
 from imud.fleet.reader import Fleet, FleetBatch
 from imud.host.threads import rare_garbage_collection
@@ -35,21 +35,15 @@ class MemoryStore:
 
     def __init__(self) -> None:
         self.rows: list[int] = []
-        self.accounts: dict[fleet_accounts.StreamKey, fleet_accounts.StoredAccount] = {}
         self.offsets: dict[fleet_accounts.BootKey, fleet_accounts.BootOffset] = {}
         self.fails = False
         self.collector: FleetCollector | None = None
         self.most = 1 << 30
 
-    def restore(self, ledger: fleet_accounts.FleetLedger) -> None:
-        for key, account in self.accounts.items():
-            ledger.restore(key, account)
-
-    def write(self, batches: Sequence[FleetBatch], accounts: fleet_accounts.Accounts, offsets: Offsets) -> None:
+    def write(self, batches: Sequence[FleetBatch], offsets: Offsets) -> None:
         if self.fails:
             raise ServerError("the store is full")
         self.rows += [sample.seq for batch in batches for sample in batch.message.samples]
-        self.accounts |= {key: account for key, account in accounts.items() if account is not None}
         self.offsets |= offsets
         if len(self.rows) >= self.most and self.collector is not None:
             self.collector.stop()
@@ -61,7 +55,7 @@ class MemoryStore:
 def collect(broker: Mosquitto | Proxy, store: MemoryStore, most: int) -> Fleet:
     fleet = Fleet(f"mqtt://127.0.0.1:{broker.port}", name="archive", retry_max_s=1.0)
     store.most = most
-    store.collector = FleetCollector(fleet, store)
+    store.collector = FleetCollector(fleet, LedgerStore(fleet, store))
 
     async def run() -> None:
         assert store.collector is not None
@@ -76,7 +70,7 @@ def begin_session(broker: Mosquitto) -> None:
     fleet = Fleet(f"mqtt://127.0.0.1:{broker.port}", name="archive", retry_max_s=1.0)
 
     async def run() -> None:
-        running = asyncio.ensure_future(FleetCollector(fleet, MemoryStore()).run())
+        running = asyncio.ensure_future(FleetCollector(fleet, LedgerStore(fleet, MemoryStore())).run())
         async with asyncio.timeout(LIMIT_S):
             while not any("Sending SUBACK to imud-reader-archive" in line for line in broker.log):
                 await asyncio.sleep(0.005)
@@ -97,15 +91,6 @@ def test_refused_messages_are_delivered_to_the_next_collector(broker: Mosquitto,
     store.fails = False
     collect(broker, store, 9)
     assert store.rows == list(range(1, 10))
-    # the new collector restored the ledger
-    gateway.send(samples_message(1, 5), samples_message(10, 12))
-    fleet = collect(broker, store, 12)
-    assert store.rows == list(range(1, 13))
-    (account,) = fleet.accounts.values()
-    assert (account.received, account.counts.duplicates, account.balance) == (12, 5, 0)
-    assert store.accounts == {
-        fleet_accounts.StreamKey("gw", "1", "bow", "samples"): fleet_accounts.StoredAccount(account.counts, [])
-    }
 
 
 class ResettingStore(MemoryStore):
@@ -115,8 +100,8 @@ class ResettingStore(MemoryStore):
         super().__init__()
         self.proxy, self.resets = proxy, resets
 
-    def write(self, batches: Sequence[FleetBatch], accounts: fleet_accounts.Accounts, offsets: Offsets) -> None:
-        super().write(batches, accounts, offsets)
+    def write(self, batches: Sequence[FleetBatch], offsets: Offsets) -> None:
+        super().write(batches, offsets)
         if self.resets:
             self.resets -= 1
             self.proxy.reset()
@@ -143,10 +128,10 @@ class SlowStore(MemoryStore):
         if not is_slow:
             self.goes_on.set()
 
-    def write(self, batches: Sequence[FleetBatch], accounts: fleet_accounts.Accounts, offsets: Offsets) -> None:
+    def write(self, batches: Sequence[FleetBatch], offsets: Offsets) -> None:
         self.sizes.append(len(batches))
         assert self.goes_on.wait(LIMIT_S)
-        super().write(batches, accounts, offsets)
+        super().write(batches, offsets)
 
 
 def test_a_slow_store_receives_larger_transactions(broker: Mosquitto, gateway: SendingGateway) -> None:
@@ -230,7 +215,7 @@ def test_lines_of_dropped_records_intervals_and_events_have_kinds() -> None:
         FleetBatch("mill", Stream.SAMPLES, intervals_message(1, 2)),
         FleetBatch("mill", Stream.EVENTS, fleet_gateway.event_message(1, 5)),
     ]
-    JsonLines(out).write(batches, {}, {})
+    JsonLines(out).write(batches, {})
     dropped, found, up = map(json.loads, out.buffer.getvalue().splitlines())
     assert dropped == HEAD | {
         "kind": "dropped", "first": 1, "last": 4, "cause": "space", "utc_ns": UTC_NS + 4_000_000,
@@ -248,7 +233,7 @@ def test_lines_report_an_unset_clock_and_a_later_line_contains_its_offset() -> N
 
     def write(message: FleetMessage) -> None:
         offset = clocks.take(message)
-        JsonLines(out).write([FleetBatch("mill", Stream.SAMPLES, message, offset)], {}, clocks.take_fresh())
+        JsonLines(out).write([FleetBatch("mill", Stream.SAMPLES, message, offset)], clocks.take_fresh())
 
     for one in messages:
         write(fleet_gateway.not_set(one))

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,9 +11,10 @@ import pytest
 
 from imud.cli.fleet import store_of
 from imud.fleet.accounts import BootKey, BootOffset
+from imud.fleet.collector import FleetStore, LedgerStore
 from imud.fleet.influx import ATTEMPTS, REQUEST_BYTES, InfluxStore, clock_lines, lines_of
 from imud.fleet.messages import DropCause, FleetMessage, Stream
-from imud.fleet.reader import FleetBatch
+from imud.fleet.reader import Fleet, FleetBatch
 from imud.host.http_post import HttpPost, PostAccess, post_url
 from imud.model.errors import BadArgument, ServerError
 from imud.model.event import Event, EventKind
@@ -77,7 +79,7 @@ class Rig:
 
     def write(self, *messages: FleetMessage) -> None:
         try:
-            self.store.write([batch(one) for one in messages], {}, {})
+            self.store.write([batch(one) for one in messages], {})
         finally:
             self.store.close()
 
@@ -123,13 +125,20 @@ def test_a_rejected_message_affects_only_itself(database: FakeDatabase, caplog: 
 
 
 def test_urls_of_stores() -> None:
-    assert isinstance(store_of("https://db/api/v2/write?org=o&bucket=b", PostAccess("/token")), InfluxStore)
-    for url, access, problem in (
-        ("http://h/write?db=a&u=x&p=secret", PostAccess(), "expected - for standard output"),
-        ("-", PostAccess("/token"), "--to-token-file, --to-ca-file: expected --to with an http or https URL"),
+    def opened(to: str, token_file: str | None, config: str | None = None) -> FleetStore:
+        args = Namespace(to=to, to_token_file=token_file, to_ca_file=None, config=config, from_begin=False)
+        return store_of(args, Fleet("mqtt://broker"))
+
+    store = opened("https://db/api/v2/write?org=o&bucket=b", "/token")
+    assert isinstance(store, LedgerStore)
+    assert isinstance(store.to, InfluxStore)
+    for to, token_file, config, problem in (
+        ("http://h/write?db=a&u=x&p=secret", None, None, "expected - for standard output"),
+        ("-", "/token", None, "--to-token-file, --to-ca-file: expected --to with an http or https URL"),
+        ("-", None, "file", "--config: expected --to with a postgresql URL"),
     ):
         with pytest.raises(BadArgument, match=problem) as refused:
-            store_of(url, access)
+            opened(to, token_file, config)
         assert "secret" not in str(refused.value)
 
 

@@ -1,32 +1,320 @@
-"""Store of `imud fleet collect --to postgresql://…`."""
+"""Store of `imud fleet collect --to postgresql://…`: connection, lease, repeated transactions and rejected messages.
 
-from collections.abc import Sequence
+    messages ──▶ FleetTransaction ──▶ COMMIT ──▶ (the collector) acknowledge
 
+Each record is stored exactly once, because one transaction contains the rows and their ledger. Any number of collectors
+writes to one database. A deadlock, or a connection that the server ends, repeats the transaction. If the database
+contains rows that the ledger does not, COPY fails. Then imud repeats the transaction with temporary tables and ON
+CONFLICT DO NOTHING, which takes twice as long. If the database cannot store a value, imud halves the messages until it
+finds the message, and stores this message in the table `imud_rejected`.
+"""
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext, suppress
+from typing import Any, Final, TypeVar
+
+from imud.fleet.accounts import BOOTS_MAX, BootKey, BootOffset
+from imud.fleet.database.rows import TableRows, check_columns
 from imud.fleet.database.settings import CollectorSettings
-from imud.fleet.reader import FleetDelivery
+from imud.fleet.database.transaction import (
+    DecodedDelivery,
+    FleetTransaction,
+    RowRemoved,
+    StoreCounts,
+    copy_rows,
+    insert_new_rows,
+)
+from imud.fleet.database.upkeep import Upkeep
+from imud.fleet.messages import FleetMessage
+from imud.fleet.reader import FleetDelivery, decode_delivery
+from imud.host.installation import needs_extra
 from imud.model.errors import ServerError
+from imud.model.units import NS_PER_S
+
+log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+# Classes of SQLSTATE that the values of a row can cause: data exception, program limit exceeded
+OF_VALUES: Final = ("22", "54")
+# SQLSTATE of conflicts between collectors: serialization failure, deadlock, lock timeout
+OF_CONFLICTS: Final = ("40001", "40P01", "55P03")
+CONFLICTS_MAX: Final = 10  # maximum number of repetitions of a transaction after conflicts
+LOCK_S: Final = 20  # maximum wait for the lock of a row or a table, s
+CONNECT_S: Final = 10  # maximum time of an attempt to connect, s
+# Number of attempts to connect again, and the pause before each, s. The restart of a server takes some seconds.
+ATTEMPTS: Final = 20
+ATTEMPT_PAUSE_S: Final = 0.5
+# TCP keep-alives of both sides: 5 s + 3 · 3 s until a dead host is detected
+KEEP_ALIVE: Final = {"idle": 5, "interval": 3, "count": 3}
+DEAD_S: Final = 15  # maximum time without an acknowledgement of sent data, s
+UPKEEP_NS: Final = 60 * NS_PER_S  # interval of the upkeep
+REJECTED_MAX: Final = 10_000  # maximum number of rows in imud_rejected
+PAYLOAD_BYTES: Final = 4096  # maximum length of a payload in imud_rejected
+REASON_CHARACTERS: Final = 1000
+
+_REJECT: Final = "INSERT INTO imud_rejected (topic, reason, payload_bytes, payload) VALUES (%s, %s, %s, %s)"
+_FORGET_REJECTED: Final = (
+    "DELETE FROM imud_rejected WHERE id IN (SELECT id FROM imud_rejected WHERE id < (SELECT id FROM imud_rejected "
+    f"ORDER BY id DESC OFFSET {REJECTED_MAX - 1} LIMIT 1) FOR UPDATE SKIP LOCKED)"
+)
 
 
 class LeaseLost(ServerError):
-    """The store lost its connection and therefore its lease. Another collector can have the lease now."""
+    """The connection ended, and with it the lease. Another collector can have the lease now."""
 
 
 class PostgresStore:
     """Store in a PostgreSQL database. Synchronization: one thread at a time."""
 
-    def __init__(self, url: str, settings: CollectorSettings = CollectorSettings(), lease: str = "") -> None:  # noqa: B008
+    def __init__(
+        self, url: str, settings: CollectorSettings = CollectorSettings(), lease: str = "", *,  # noqa: B008
+        from_begin: bool = False, now_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:  # fmt: skip
         """Connect and create missing tables. `lease` is the name of the lease that `take_lease` takes; empty: none.
-        Raises ServerError."""
-        raise NotImplementedError
+        With `from_begin`, numbers before the first message of a stream count as missing. Raises ServerError."""
+        with needs_extra("fleet", ServerError):
+            import psycopg
+        self.counts = StoreCounts()  # since the start of this process
+        self._url, self._lease, self._from_begin, self._now_ns = url, lease, from_begin, now_ns
+        self._error: type[Exception] = psycopg.Error
+        self._conflict: type[Exception] = psycopg.errors.UniqueViolation
+        self._has_lease = False
+        self._offsets: dict[BootKey, BootOffset] = {}  # newest clock offsets of boots with an offset in the database
+        self._upkeep = Upkeep(settings)
+        self._upkeep_ns = now_ns()
+        self._connect()
+
+    # --- connection and lease -----------------------------------------------------------------------------------------
+
+    def _connect(self) -> None:
+        import psycopg
+
+        keep_alive: dict[str, Any] = {f"keepalives_{name}": value for name, value in KEEP_ALIVE.items()}
+        try:
+            self._connection: Any = psycopg.connect(
+                self._url, connect_timeout=CONNECT_S, application_name="imud fleet collect", client_encoding="utf8",
+                tcp_user_timeout=DEAD_S * 1000, **keep_alive,
+            )  # fmt: skip
+            # a statement after a lock must see the rows that the transaction before it stored
+            self._connection.isolation_level = psycopg.IsolationLevel.READ_COMMITTED
+            with self._connection.transaction(), self._connection.cursor() as cursor:
+                for name, value in KEEP_ALIVE.items():
+                    cursor.execute(f"SET tcp_keepalives_{name} = {value}")
+                cursor.execute(f"SET tcp_user_timeout = {DEAD_S * 1000}")
+                cursor.execute(f"SET lock_timeout = '{round(LOCK_S * 1000)}ms'")
+            with self._connection.transaction(), self._connection.cursor() as cursor:
+                self._upkeep.prepare(cursor)
+        except psycopg.ProgrammingError as error:
+            self.close()
+            if error.sqlstate is not None:  # an error of the server, not of the URL
+                raise ServerError(f"PostgreSQL: {_sentence(error)}") from error
+            raise ServerError(
+                f"PostgreSQL: cannot parse the URL: {_unquoted(error)}; imud does not show it because of its password"
+            ) from None
+        except psycopg.Error as error:
+            self.close()
+            raise ServerError(f"PostgreSQL: {_sentence(error)}") from error
+        except ServerError:
+            self.close()
+            raise
 
     def take_lease(self) -> bool:
-        """Take the lease. Return False if another connection has it. Raises ServerError."""
-        raise NotImplementedError
+        """Take the lease. Return False if another connection has it. `close`, or the end of the connection, releases
+        the lease. Raises ServerError."""
+        if self._has_lease:
+            return True
+        try:
+            self._try_lease()
+        except ServerError:
+            # a connection without a lease can be replaced
+            if not self._connection.closed:
+                raise
+            self._connect()
+            self._try_lease()
+        return self._has_lease
 
-    def write(self, deliveries: Sequence[FleetDelivery]) -> None:
-        """Store the messages in one transaction. Raises LeaseLost after a lost connection if the store has a lease,
-        otherwise ServerError."""
-        raise NotImplementedError
+    def _try_lease(self) -> None:
+        def lock(cursor: Any) -> bool:
+            cursor.execute("SELECT pg_try_advisory_lock(hashtextextended(%s, 0))", (self._lease,))
+            return bool(cursor.fetchone()[0])
+
+        self._has_lease = self._transact(lock)
 
     def close(self) -> None:
         """Close the connection. A second call does nothing."""
+        self._has_lease = False
+        connection = getattr(self, "_connection", None)
+        if connection is not None:
+            with suppress(self._error):
+                connection.close()
+
+    # --- messages -----------------------------------------------------------------------------------------------------
+
+    def write(self, deliveries: Sequence[FleetDelivery]) -> None:
+        """Store messages in one transaction. Without messages, check the lease and do the upkeep. Raises LeaseLost if
+        the connection ended and the store had the lease, otherwise ServerError."""
+        items, invalid = _decoded(deliveries)
+        try:
+            self._write(items, invalid)
+        except ServerError as error:
+            if not self._connection.closed:
+                raise
+            if self._has_lease:
+                self._has_lease = False
+                raise LeaseLost(str(error)) from error
+            self._connect_again(error)
+            self._write(items, invalid)
+
+    def ledger_text(self) -> str:
+        """Return a summary of this run and of the ledger in the database. Raises ServerError."""
+
+        def read(cursor: Any) -> Any:
+            cursor.execute(
+                "SELECT count(*), coalesce(sum(missing), 0), coalesce(sum(dropped), 0), count(*) FILTER (WHERE "
+                "newest - begin + 1 <> whole + thinned + dropped + missing) FROM imud_ledger"
+            )
+            return cursor.fetchone()
+
+        streams, missing, dropped, unbalanced = self._transact(read)
+        own = self.counts
+        return (
+            f"this run: {own.messages} messages, {own.rows} rows, {own.duplicates} duplicate numbers, {own.rejected} "
+            f"rejected messages\nledger of the database: {streams} streams, {missing} missing, {dropped} dropped"
+            + f"; {unbalanced} streams do not balance"
+            * bool(unbalanced)
+        )
+
+    def _connect_again(self, cause: ServerError) -> None:
+        """Connect to a server that ended the connection. Raises ServerError after ATTEMPTS attempts."""
+        log.warning("%s; connecting again", cause)
+        for attempt in range(ATTEMPTS):
+            time.sleep(ATTEMPT_PAUSE_S)
+            with suppress(ServerError) if attempt < ATTEMPTS - 1 else nullcontext():
+                self._connect()
+                return
+
+    def _write(self, items: Sequence[DecodedDelivery], invalid: Sequence[tuple[FleetDelivery, str]]) -> None:
+        """Store messages and rejected messages. A repeated call stores each message once."""
+        if items:
+            self._store(items)
+        if invalid:
+            self._reject(invalid)
+        if self._now_ns() >= self._upkeep_ns:
+            self._upkeep_ns = self._now_ns() + UPKEEP_NS
+            self._run_upkeep()
+        elif self._has_lease and not items:
+            self._transact(lambda cursor: cursor.execute("SELECT 1"))
+
+    def _store(self, items: Sequence[DecodedDelivery]) -> None:
+        """Store messages in one transaction. Store halves if a value cannot be stored. Raises ServerError."""
+        try:
+            try:
+                self._store_with(copy_rows, items)
+            except self._conflict:
+                self._store_with(insert_new_rows, items)
+        except (self._error, ValueError, OverflowError) as error:
+            if isinstance(error, self._error) and not _sqlstate(error).startswith(OF_VALUES):
+                raise ServerError(f"PostgreSQL: {_sentence(error)}") from error
+            if len(items) == 1:
+                self._reject([(items[0].delivery, _sentence(error))])
+                return
+            middle = len(items) // 2
+            self._store(items[:middle])
+            self._store(items[middle:])
+
+    def _store_with(self, insert: Callable[[Any, TableRows], None], items: Sequence[DecodedDelivery]) -> None:
+        def run(cursor: Any) -> FleetTransaction:
+            one = FleetTransaction(cursor, items, self._offsets, from_begin=self._from_begin)
+            one.run(insert)
+            return one
+
+        done = self._repeated(run)
+        self.counts.add(done.counts)
+        self._offsets |= done.offsets
+        while len(self._offsets) > BOOTS_MAX:
+            del self._offsets[next(iter(self._offsets))]
+
+    def _repeated(self, work: Callable[[Any], T]) -> T:
+        """Run a transaction. Repeat it after a conflict with another collector."""
+        for attempt in range(CONFLICTS_MAX):
+            try:
+                with self._connection.transaction(), self._connection.cursor() as cursor:
+                    return work(cursor)
+            except (self._error, RowRemoved) as error:
+                if isinstance(error, self._error) and _sqlstate(error) not in OF_CONFLICTS:
+                    raise
+                log.warning("PostgreSQL: %s; attempt %d of %d", _sentence(error), attempt + 1, CONFLICTS_MAX)
+        raise ServerError(
+            f"PostgreSQL: cannot store messages after {CONFLICTS_MAX} conflicts with other transactions; see "
+            "pg_stat_activity"
+        )
+
+    def _transact(self, work: Callable[[Any], T]) -> T:
+        """Run a transaction. Raises ServerError."""
+        try:
+            return self._repeated(work)
+        except self._error as error:
+            raise ServerError(f"PostgreSQL: {_sentence(error)}") from error
+
+    def _reject(self, invalid: Sequence[tuple[FleetDelivery, str]]) -> None:
+        """Store messages in the table `imud_rejected`. Raises ServerError."""
+        for delivery, reason in invalid:
+            log.warning("%s: %s; the message is in imud_rejected", delivery.topic, reason)
+        rows = [
+            (one.topic, _storable(reason), len(one.payload), bytes(one.payload[:PAYLOAD_BYTES]))
+            for one, reason in invalid
+        ]
+
+        def insert(cursor: Any) -> None:
+            cursor.executemany(_REJECT, rows)
+            cursor.execute(_FORGET_REJECTED)
+
+        self._transact(insert)
+        self.counts.rejected += len(invalid)
+
+    def _run_upkeep(self) -> None:
+        """Do the upkeep of the tables. An error does not end the collector."""
+        try:
+            self._transact(self._upkeep.run)
+        except ServerError as error:
+            if self._connection.closed:
+                raise
+            log.warning("%s; imud repeats the upkeep of the tables in %d s", error, UPKEEP_NS // NS_PER_S)
+
+
+def _decoded(
+    deliveries: Sequence[FleetDelivery],
+) -> tuple[list[DecodedDelivery], list[tuple[FleetDelivery, str]]]:
+    """Return the decoded messages, and the other messages with the reason."""
+    items, invalid = list[DecodedDelivery](), list[tuple[FleetDelivery, str]]()
+    for one in deliveries:
+        try:
+            parts, content = decode_delivery(one)
+            if isinstance(content, FleetMessage):
+                check_columns(content.intervals)
+        except ValueError as error:
+            invalid.append((one, str(error)))
+        else:
+            items.append(DecodedDelivery(one, parts.site, parts.gateway, parts.leaf, content))
+    return items, invalid
+
+
+def _sqlstate(error: Exception) -> str:
+    return getattr(error, "sqlstate", None) or ""
+
+
+def _storable(text: str) -> str:
+    """Return text that PostgreSQL can store."""
+    return text.encode("utf-8", "backslashreplace").decode().replace("\0", "\\0")[:REASON_CHARACTERS]
+
+
+def _sentence(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _unquoted(error: BaseException) -> str:
+    """Return the problem without the part of the URL that libpq quotes."""
+    return _sentence(error).partition('"')[0].rstrip(": ")
