@@ -368,7 +368,7 @@ MAY_READ_CLOCKS = (
     "imud.host.clock",
     "imud.host.event_loop",  # the remaining time of a wait, by the clock of asyncio's timers
     "imud.cli",  # a process of its own, like the client, the fleet reader and the simulator
-    "imud.client", "imud.fleet.reader", "imud.sim.__main__",
+    "imud.client", "imud.fleet.reader", "imud.fleet.database.store", "imud.sim.__main__",
     "imud.links",  # in the callback that reads, and in waits for the end of a transfer
     "imud.web.foxglove",  # the server of `imud foxglove`, a process of its own
 )  # fmt: skip
@@ -505,7 +505,7 @@ TESTED_IN = {
     "imud.drivers.imu61x.registers": "drivers/imu61x/test_i2c.py",
     "imud.drivers.imu61x.uart.driver": "drivers/imu61x/uart/test_commands.py",
     "imud.drivers.polled_frames": "drivers/test_every_polled_driver.py",
-    "imud.fleet.settings": "fleet/test_publisher.py",
+    "imud.fleet.settings": "fleet/test_publisher.py", "imud.fleet.database.tables": "fleet/database/test_rows.py",
     "imud.links.cyclic_sender": "links/test_socketcan.py", "imud.host.netlink": "links/test_socketcan.py",
     "imud.model.bucket": "publishers/socket/test_history.py",
     "imud.publishers.ros2.options": "publishers/ros2/test_output.py",

@@ -146,7 +146,7 @@ AGE_OLD_S: Final = 999.9  # maximum age that is shown in seconds, s
 Number = float | int | None
 
 
-class Column(NamedTuple):
+class OverviewColumn(NamedTuple):
     """Column of the overview."""
 
     title: str
@@ -158,7 +158,7 @@ class Column(NamedTuple):
 
 def _number(
     title: str, width: int, value: Callable[[DeviceHistory, int], Number], show: Callable[[float], str]
-) -> Column:
+) -> OverviewColumn:
     def text(device: DeviceHistory, now_ns: int) -> str:
         found = value(device, now_ns)
         return NONE if found is None else fitted(found, width, show)
@@ -167,7 +167,7 @@ def _number(
         found = value(device, now_ns)
         return -inf if found is None else found
 
-    return Column(title, width, text, key)
+    return OverviewColumn(title, width, text, key)
 
 
 def age_s(device: DeviceHistory, now_ns: int) -> float | None:
@@ -224,14 +224,14 @@ def _hundredths(value: float) -> str:
     return f"{value:.2f}"
 
 
-NAME: Final = Column(
+NAME: Final = OverviewColumn(
     "DEVICE",
     NAME_WIDTH,
     lambda device, now_ns: shortened(printable(device.status.name, TEXT_MAX), NAME_WIDTH),
     lambda device, now_ns: device.status.name,
     is_number=False,
 )
-CONDITION: Final = Column(
+CONDITION: Final = OverviewColumn(
     "CONDITION",
     9,
     lambda device, now_ns: device.status.word,
@@ -239,7 +239,7 @@ CONDITION: Final = Column(
     is_number=False,
 )
 RATE: Final = _number("HZ", 6, lambda device, now_ns: device.status.rate_hz, _tenths)
-AGE: Final = Column(
+AGE: Final = OverviewColumn(
     "AGE",
     5,
     lambda device, now_ns: NONE if (age := age_s(device, now_ns)) is None else duration(age),
@@ -247,7 +247,7 @@ AGE: Final = Column(
 )
 LOST: Final = _number("LOST", 5, lambda device, now_ns: lost(device.status.ledger), _whole)
 ERROR: Final = _number("±µs", 5, _error_us, _whole)
-SYNC: Final = Column(
+SYNC: Final = OverviewColumn(
     "STAMP",
     5,
     lambda device, now_ns: NONE if device.newest is None else str(device.newest.sync)[:5],
@@ -256,7 +256,7 @@ SYNC: Final = Column(
 )
 
 # Sets of columns by name. Each set has at most WIDTH characters, with one space between two columns.
-VIEWS: Final[dict[str, tuple[Column, ...]]] = {
+VIEWS: Final[dict[str, tuple[OverviewColumn, ...]]] = {
     "motion": (
         NAME, CONDITION, RATE, AGE, LOST, ERROR,
         _number("ROLL°", 6, _angle(0), _tenths),
@@ -293,17 +293,17 @@ VIEWS: Final[dict[str, tuple[Column, ...]]] = {
 SORTS: Final = (NAME, CONDITION, RATE, AGE, LOST, ERROR)  # Sort columns. The key `s` selects the next one.
 
 
-def head(columns: Iterable[Column]) -> str:
+def head(columns: Iterable[OverviewColumn]) -> str:
     """Format the titles of the columns."""
     return _line((column.title, column) for column in columns)
 
 
-def row(device: DeviceHistory, columns: Iterable[Column], now_ns: int) -> str:
+def row(device: DeviceHistory, columns: Iterable[OverviewColumn], now_ns: int) -> str:
     """Format the row of one device."""
     return _line((column.text(device, now_ns), column) for column in columns)
 
 
-def _line(cells: Iterable[tuple[str, Column]]) -> str:
+def _line(cells: Iterable[tuple[str, OverviewColumn]]) -> str:
     parts = [
         text[: column.width].rjust(column.width) if column.is_number else text[: column.width].ljust(column.width)
         for text, column in cells
@@ -312,7 +312,7 @@ def _line(cells: Iterable[tuple[str, Column]]) -> str:
 
 
 def chosen(
-    devices: Iterable[DeviceHistory], sort: Column, now_ns: int, *, backwards: bool = False, words: str = ""
+    devices: Iterable[DeviceHistory], sort: OverviewColumn, now_ns: int, *, backwards: bool = False, words: str = ""
 ) -> list[DeviceHistory]:
     """Return the devices that contain all `words`, sorted; the largest number first.
 

@@ -36,8 +36,9 @@ from imud.contracts.registry import INTERFACE_VERSION
 from imud.contracts.setting import AppliedSettings, SettingsReport
 from imud.contracts.status import FlightStatus
 from imud.drivers import DRIVERS
-from imud.fleet import messages, postgres
+from imud.fleet import messages
 from imud.fleet.accounts import GatewayState
+from imud.fleet.database.tables import TABLES as DATABASE_TABLES
 from imud.formats import jsonrpc, recording, records, ring, slot
 from imud.formats.influx import event_fields, measure_fields, sample_fields
 from imud.model.errors import ConfigError, ImudError
@@ -410,10 +411,9 @@ def other_outputs() -> Facts:
         (ROOT / f"imud/{name}.py").read_text() for name in ("fleet/influx", "publishers/influx/publisher")
     )
     found |= {f"influx {name}": "measurement" for name in re.findall(r'"(imud_[a-z]+)"', sources)}
-    for table in (postgres.SAMPLES, postgres.RECORDS):
-        found |= {f"postgresql {table.name}.{column}": kind for column, kind in table.columns}
-        found[f"postgresql {table.name}, primary key"] = table.primary
-    found |= {f"postgresql {name}": postgres.SCHEMA[name] for name in (postgres.LEDGER, postgres.BOOTS)}
+    for table in DATABASE_TABLES:
+        found |= {f"postgresql {table.name}.{one.name}": one.type for one in table.columns}
+        found[f"postgresql {table.name}, primary key"] = ", ".join(table.primary)
     for heading in (Heading.TRUE, Heading.MAGNETIC):
         reference = HeadingReference(heading, 3.0)
         paths = [*motion(FULL, reference), *surroundings(FULL, reference)]

@@ -122,8 +122,8 @@ class PostgresStore:
             raise
 
     def take_lease(self) -> bool:
-        """Take the lease. Return False if another connection has it. `close`, or the end of the connection, releases
-        the lease. Raises ServerError."""
+        """Take the lease. Return False if another connection has it. The store releases the lease when its connection
+        ends. Raises ServerError."""
         if self._has_lease:
             return True
         try:

@@ -246,7 +246,8 @@ def test_messages_that_cannot_be_stored_are_rejected(database: str) -> None:
     found = query(
         database, "SELECT topic, payload_bytes, payload, reason FROM imud_rejected ORDER BY reason COLLATE \"C\""
     )  # fmt: skip
-    assert [(topic, size, reason.partition(", got")[0].partition(" CONTEXT")[0]) for topic, size, _, reason in found] == [
+    reasons = [reason.partition(", got")[0].partition(" CONTEXT")[0] for *_, reason in found]
+    assert [(*row[:2], reason) for row, reason in zip(found, reasons, strict=True)] == [
         ("imud/mill/gw/bow/events", len(delivery_of(event_message(3, 3)).payload), "division by zero"),
         ("imud/mill/gw/bow/statistics", len(delivery_of(strange[1]).payload), "expected 3 components of mag_t"),
         ("imud/mill/gw/bow/samples", 5000, "expected a message of a gateway"),
