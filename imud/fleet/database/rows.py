@@ -79,10 +79,10 @@ class TableRows:
         names = self.names
         with cursor.copy(f"COPY {target} ({', '.join(names)}) FROM STDIN (FORMAT BINARY)") as copy:
             copy.set_types([_types(self.table)[name] for name in names])
-            for row in self._in_order(names):
+            for row in self.rows(names):
                 copy.write_row(row)
 
-    def _in_order(self, names: Names) -> Iterator[Row]:
+    def rows(self, names: Names) -> Iterator[Row]:
         """Yield the rows with the values of the columns `names`, None for an absent value."""
         for own, rows in self._rows.items():
             if own == names:

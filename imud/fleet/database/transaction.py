@@ -64,6 +64,9 @@ class StoreCounts(msgspec.Struct):
 class RowRemoved(Exception):
     """Another transaction removed a row between two statements. The caller repeats the transaction."""
 
+    def __init__(self) -> None:
+        super().__init__("another transaction removed a row between two statements")
+
 
 _KEY: Final = "gateway text, boot text, device text, stream text"
 _LEDGER_COLUMNS: Final = (

@@ -4,7 +4,7 @@ known."""
 import random
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import closing
 from typing import Any
 
@@ -14,12 +14,12 @@ import pytest
 from imud.fleet import messages as fleet_messages
 from imud.fleet.accounts import GatewayState
 from imud.fleet.database.store import LeaseLost, PostgresStore
-from imud.fleet.messages import FleetMessage, MessageKind, Stream
-from imud.fleet.reader import FleetDelivery, ReaderConnection, brokers_of
+from imud.fleet.messages import MessageKind
 from imud.fleet.statistics import SCALARS, VECTORS
 from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
 from imud.model.sample import Sample, Sync
+from tests.fleet.database.deliveries import BALANCE, deliveries, delivery, delivery_of, ledgers, query, write
 from tests.fleet.fleet_gateway import (
     UTC_NS,
     SendingGateway,
@@ -37,59 +37,7 @@ from tests.support.daemon_process import LIMIT_S, wait_until
 pytestmark = [pytest.mark.skipif(bool(NO_POSTGRES), reason=NO_POSTGRES), pytest.mark.live]
 
 
-@pytest.fixture(scope="module")
-def server() -> Iterator[str]:
-    with running_server() as made:
-        yield made.url
-
-
-@pytest.fixture
-def database(server: str) -> str:
-    query(server, "DROP SCHEMA public CASCADE; CREATE SCHEMA public")
-    return server
-
-
-def query(url: str, text: str) -> list[Any]:
-    import psycopg
-
-    with psycopg.connect(url) as connection:
-        cursor = connection.execute(text.encode())
-        return cursor.fetchall() if cursor.description else []
-
-
 FIELDS = ", ".join((*VECTORS, *SCALARS))
-STREAMS = {MessageKind.INTERVALS: Stream.STATISTICS, MessageKind.EVENTS: Stream.EVENTS}
-
-
-def delivery(topic: str, payload: bytes) -> FleetDelivery:
-    return FleetDelivery(topic, payload, False, 0, ReaderConnection(brokers_of(["mqtt://broker"])[0]))
-
-
-def delivery_of(content: FleetMessage | GatewayState) -> FleetDelivery:
-    """Return the message as the broker delivers it."""
-    if isinstance(content, GatewayState):
-        return delivery("imud/mill/gw/state", msgspec.json.encode(content))
-    leaf = STREAMS.get(content.kind, Stream.SAMPLES)
-    topic = fleet_messages.topic_of("mill", content.gateway, content.device, leaf)
-    return delivery(topic, fleet_messages.encode_message(content))
-
-
-def deliveries(*contents: FleetMessage | GatewayState) -> Sequence[FleetDelivery]:
-    return [delivery_of(one) for one in contents]
-
-
-def write(url: str, *contents: FleetMessage | GatewayState, from_begin: bool = False) -> PostgresStore:
-    """Write messages with a store of its own. Return the closed store."""
-    with closing(PostgresStore(url, from_begin=from_begin)) as store:
-        store.write(deliveries(*contents))
-    return store
-
-
-def ledgers(url: str, columns: str) -> list[Any]:
-    return query(url, f"SELECT {columns} FROM imud_ledger ORDER BY gateway, boot, device, stream")
-
-
-BALANCE = "newest - begin + 1 - whole - thinned - dropped - missing"
 
 
 def test_rows_have_time_numbers_and_values(database: str) -> None:
