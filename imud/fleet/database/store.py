@@ -63,7 +63,7 @@ _FORGET_REJECTED: Final = (
 
 
 class LeaseLost(ServerError):
-    """The connection ended, and with it the lease. Another collector can have the lease now."""
+    """The connection ended, and with it the lease. The lease can belong to another collector now."""
 
 
 class PostgresStore:
@@ -122,8 +122,8 @@ class PostgresStore:
             raise
 
     def take_lease(self) -> bool:
-        """Take the lease. Return False if another connection has it. The store releases the lease when its connection
-        ends. Raises ServerError."""
+        """Acquire the lease until the connection ends. Return False if it belongs to another connection. Raises
+        ServerError."""
         if self._has_lease:
             return True
         try:
