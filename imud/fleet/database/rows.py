@@ -105,10 +105,9 @@ def _types(table: FleetTable) -> Mapping[str, str]:
     return found
 
 
-def check_columns(intervals: Iterable[Interval]) -> None:
-    """Raise ValueError if a table has no column for a value of an interval."""
-    for one in intervals:
-        _columns_of(_shape(one))
+def columns_of(intervals: Iterable[Interval]) -> list[Names]:
+    """Return the columns of each interval. Raises ValueError if a table has no column for a value."""
+    return [_columns_of(_shape(one)) for one in intervals]
 
 
 class TurnRows:
@@ -124,14 +123,14 @@ class TurnRows:
     def tables(self) -> tuple[TableRows, ...]:
         return self.samples, self.intervals, self.events, self.dropped
 
-    def add(self, batch: FleetBatch) -> None:
-        """Add the rows of a message. Raises ValueError if a table has no column for a value."""
+    def add(self, batch: FleetBatch, columns: Sequence[Names]) -> None:
+        """Add the rows of a message. `columns` are the columns of its intervals, from `columns_of`."""
         message = batch.message
         head = (batch.site, message.gateway, message.boot, message.device)
         if message.samples:
             self._add_samples(batch, head)
-        for one in message.intervals:
-            self._add_interval(batch, head, one)
+        for one, names in zip(message.intervals, columns, strict=True):
+            self.intervals.add(names, [_interval_row(batch, head, one)])
         for number, event in enumerate(message.events, message.first):
             at = _clock(batch, message.utc_ns, event.t_ns)
             details = _JSONB_VERSION + msgspec.json.encode(event.detail) if event.detail else None
@@ -168,21 +167,21 @@ class TurnRows:
             columns += _parts(positions, len(_POSITION_COLUMNS))
         self.samples.add(tuple(names), zip(*columns, strict=False))  # `head` repeats without an end
 
-    def _add_interval(self, batch: FleetBatch, head: Row, one: Interval) -> None:
-        begin = batch.time_of(one.begin_utc_ns, one.begin_t_ns)
-        end_utc_ns = one.end_utc_ns
-        # if the time of the start is correct, the clock did not step later
-        if begin.utc_ns != one.begin_utc_ns:
-            end_utc_ns = batch.time_of(end_utc_ns, one.end_t_ns).utc_ns
-        values: list[float] = []
-        for measures in one.values.values():
-            for measure in MEASURES:
-                values += getattr(measures, measure) or ()
-        row = (
-            *head, _postgres_us(begin.utc_ns), *begin, batch.stream.value, one.first, one.last, one.count,
-            one.begin_t_ns, one.end_t_ns, end_utc_ns, one.t_err_ns, one.sync.value, one.status, *values,
-        )  # fmt: skip
-        self.intervals.add(_columns_of(_shape(one)), [row])
+
+def _interval_row(batch: FleetBatch, head: Row, one: Interval) -> Row:
+    begin = batch.time_of(one.begin_utc_ns, one.begin_t_ns)
+    end_utc_ns = one.end_utc_ns
+    # if the time of the start is correct, the clock did not step later
+    if begin.utc_ns != one.begin_utc_ns:
+        end_utc_ns = batch.time_of(end_utc_ns, one.end_t_ns).utc_ns
+    values: list[float] = []
+    for measures in one.values.values():
+        for part in msgspec.structs.astuple(measures):
+            values += part or ()
+    return (
+        *head, _postgres_us(begin.utc_ns), *begin, batch.stream.value, one.first, one.last, one.count,
+        one.begin_t_ns, one.end_t_ns, end_utc_ns, one.t_err_ns, one.sync.value, one.status, *values,
+    )  # fmt: skip
 
 
 _Shape = tuple[tuple[str, tuple[int, ...]], ...]  # names and numbers of components of each measure

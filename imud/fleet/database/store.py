@@ -16,7 +16,7 @@ from contextlib import nullcontext, suppress
 from typing import Any, Final, TypeVar
 
 from imud.fleet.accounts import BOOTS_MAX, BootKey, BootOffset
-from imud.fleet.database.rows import TableRows, check_columns
+from imud.fleet.database.rows import TableRows, columns_of
 from imud.fleet.database.settings import CollectorSettings
 from imud.fleet.database.transaction import (
     DecodedDelivery,
@@ -293,12 +293,11 @@ def _decoded(
     for one in deliveries:
         try:
             parts, content = decode_delivery(one)
-            if isinstance(content, FleetMessage):
-                check_columns(content.intervals)
+            columns = columns_of(content.intervals) if isinstance(content, FleetMessage) else []
         except ValueError as error:
             invalid.append((one, str(error)))
         else:
-            items.append(DecodedDelivery(one, parts.site, parts.gateway, parts.leaf, content))
+            items.append(DecodedDelivery(one, parts.site, parts.gateway, parts.leaf, content, columns))
     return items, invalid
 
 

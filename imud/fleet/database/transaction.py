@@ -29,7 +29,7 @@ from imud.fleet.accounts import (
     clock_offset,
     offset_of,
 )
-from imud.fleet.database.rows import TableRows, TurnRows
+from imud.fleet.database.rows import Names, TableRows, TurnRows
 from imud.fleet.database.tables import TIMED, FleetTable
 from imud.fleet.messages import FleetMessage, Stream
 from imud.fleet.reader import FleetBatch, FleetDelivery
@@ -45,6 +45,7 @@ class DecodedDelivery(NamedTuple):
     gateway: str
     leaf: str  # name of the stream; `state` for a state
     content: FleetMessage | GatewayState
+    columns: Sequence[Names]  # columns of the intervals of a message
 
 
 class StoreCounts(msgspec.Struct):
@@ -308,7 +309,7 @@ class FleetTransaction:
             if fresh is not None:
                 key = boot_of(message)
                 offset = self.offsets.get(key) or self._known.get(key)
-                rows.add(FleetBatch(one.site, stream, fresh, offset))
+                rows.add(FleetBatch(one.site, stream, fresh, offset), one.columns)
         return rows
 
     def _take_positions(self, ledgers: Mapping[StreamKey, _LedgerRow]) -> None:

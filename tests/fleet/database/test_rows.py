@@ -7,7 +7,7 @@ import msgspec
 import pytest
 
 from imud.fleet.accounts import BootOffset
-from imud.fleet.database.rows import TurnRows, check_columns
+from imud.fleet.database.rows import TurnRows, columns_of
 from imud.fleet.database.tables import COMPONENTS, TABLES, Component, FleetTable
 from imud.fleet.messages import DropCause, FleetMessage, Interval, Measures, Stream
 from imud.fleet.reader import FleetBatch
@@ -143,7 +143,7 @@ KNOWN = BootOffset(0, UTC_NS, 40)
 def record(message: FleetMessage, offset: BootOffset | None = None) -> dict[str, object]:
     """Return the only row of a message."""
     turn = TurnRows()
-    turn.add(FleetBatch("mill", Stream.STATISTICS, message, offset))
+    turn.add(FleetBatch("mill", Stream.STATISTICS, message, offset), columns_of(message.intervals))
     (own,) = [one for one in turn.tables if one.count]
     (row,) = own.rows(own.names)
     return dict(zip(own.names, row, strict=True))
@@ -177,10 +177,10 @@ def test_a_record_without_a_clock_uses_the_offset_of_its_boot() -> None:
 )
 def test_values_without_a_column_are_reported(name: str, measures: Measures, problem: str) -> None:
     (one,) = intervals_message(4, 5).intervals
-    check_columns([one, wide_interval()])
+    columns_of([one, wide_interval()])
     bad = msgspec.structs.replace(one, values=one.values | {name: measures})
     with pytest.raises(ValueError, match=problem):
-        check_columns([wide_interval(), bad])
+        columns_of([wide_interval(), bad])
 
 
 def test_tables_describe_each_component_of_samples_and_intervals() -> None:

@@ -62,6 +62,12 @@ def test_repeated_messages_after_a_restart_are_duplicates_without_rows(database:
     assert query(database, "SELECT seq FROM imud_samples ORDER BY seq") == [(n,) for n in range(1, 8)]
     assert ledgers(database, f"whole, duplicates, {BALANCE}") == [(7, 7, 0)]
     assert (store.counts.messages, store.counts.rows, store.counts.duplicates) == (2, 2, 7)
+    with closing(PostgresStore(database)) as other:
+        other.write(deliveries(samples_message(9, 9), dropped_message(10, 12)))
+        assert other.ledger_text().splitlines() == [
+            "this run: 2 messages, 2 rows, 0 duplicate numbers, 0 rejected messages",
+            "ledger of the database: 1 streams, 1 missing, 3 dropped",
+        ]
 
 
 LIFTED_NS = 1_750_000_000_000_000_000  # time to which systemd sets a clock without a battery: after 2020, but wrong

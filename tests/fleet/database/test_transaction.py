@@ -98,7 +98,7 @@ def open_transaction(url: str, *messages: FleetMessage) -> Iterator[Any]:
     """Store messages in a transaction that ends with the block. Yield its connection."""
     import psycopg
 
-    items = [DecodedDelivery(delivery_of(one), "mill", "gw", "samples", one) for one in messages]
+    items = [DecodedDelivery(delivery_of(one), "mill", "gw", "samples", one, []) for one in messages]
     with psycopg.connect(url) as connection:
         FleetTransaction(connection.cursor(), items, {}, from_begin=False).run(copy_rows)
         yield connection
@@ -134,14 +134,18 @@ def test_rows_get_the_clock_of_a_concurrent_transaction(
     assert query(database, "SELECT count(*) FROM imud_samples") == [(11 if is_known else 9,)]
 
 
-def test_a_concurrent_transaction_with_the_same_message_is_a_duplicate(database: str) -> None:
-    for message in (samples_message(1, 5), samples_message(4, 9)):
-        write(database)
-        with open_transaction(database, message) as connection, waiting(database, samples_message(1, 9)) as store:
+def test_concurrent_transactions_share_the_ledger_of_a_stream(database: str) -> None:
+    """The first two messages create the ledger, the other two messages change it."""
+    write(database)
+    for first, second in (((1, 5), (1, 9)), ((20, 25), (10, 12))):
+        with (
+            open_transaction(database, samples_message(*first)) as connection,
+            waiting(database, samples_message(*second)) as store,
+        ):
             connection.commit()
-    assert store.result().counts.duplicates == 9
-    assert query(database, "SELECT seq FROM imud_samples ORDER BY 1") == [(n,) for n in range(1, 10)]
-    assert ledgers(database, f"whole, missing, duplicates, {BALANCE}") == [(9, 0, 5 + 6 + 9, 0)]
+        assert store.result().counts.duplicates == (5 if first == (1, 5) else 0)
+    assert query(database, "SELECT seq FROM imud_samples ORDER BY 1") == [(n,) for n in (*range(1, 13), *range(20, 26))]
+    assert ledgers(database, f"newest, whole, missing, duplicates, {BALANCE}") == [(25, 18, 7, 5, 0)]
 
 
 def test_a_transaction_that_ends_without_a_commit_leaves_nothing(database: str) -> None:
