@@ -180,11 +180,11 @@ class PostgresStore:
 
         streams, missing, dropped, unbalanced = self._transact(read)
         own = self.counts
+        open_streams = f", streams that do not balance: {unbalanced}" if unbalanced else ""
         return (
             f"this run: {own.messages} messages, {own.rows} rows, {own.duplicates} duplicate numbers, {own.rejected} "
-            f"rejected messages\nledger of the database: {streams} streams, {missing} missing, {dropped} dropped"
-            + f"; {unbalanced} streams do not balance"
-            * bool(unbalanced)
+            "rejected messages\n"
+            f"ledger of the database: streams: {streams}, missing: {missing}, dropped: {dropped}{open_streams}"
         )
 
     def _connect_again(self, cause: ServerError) -> None:

@@ -66,7 +66,7 @@ def test_repeated_messages_after_a_restart_are_duplicates_without_rows(database:
         other.write(deliveries(samples_message(9, 9), dropped_message(10, 12)))
         assert other.ledger_text().splitlines() == [
             "this run: 2 messages, 2 rows, 0 duplicate numbers, 0 rejected messages",
-            "ledger of the database: 1 streams, 1 missing, 3 dropped",
+            "ledger of the database: streams: 1, missing: 1, dropped: 3",
         ]
 
 
