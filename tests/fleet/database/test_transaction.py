@@ -135,13 +135,12 @@ def test_rows_get_the_clock_of_a_concurrent_transaction(
 
 
 def test_concurrent_transactions_share_the_ledger_of_a_stream(database: str) -> None:
-    """The first two messages create the ledger, the other two messages change it."""
+    """The first two messages create the ledger, the other two messages change it. No message has a clock offset, so
+    that the transactions share the lock of the boot."""
     write(database)
     for first, second in (((1, 5), (1, 9)), ((20, 25), (10, 12))):
-        with (
-            open_transaction(database, samples_message(*first)) as connection,
-            waiting(database, samples_message(*second)) as store,
-        ):
+        one, two = (not_set(samples_message(*span)) for span in (first, second))
+        with open_transaction(database, one) as connection, waiting(database, two) as store:
             connection.commit()
         assert store.result().counts.duplicates == (5 if first == (1, 5) else 0)
     assert query(database, "SELECT seq FROM imud_samples ORDER BY 1") == [(n,) for n in (*range(1, 13), *range(20, 26))]
@@ -203,6 +202,8 @@ def test_the_newest_state_of_a_gateway_is_a_row(database: str) -> None:
     assert query(database, f"SELECT {columns} FROM imud_gateways") == [
         ("mill", "gw", "1", False, "lost", "0.1.0", ["aft", "bow"], None, None, {"sent": 2})
     ]
+    write(database, msgspec.structs.replace(state(3), devices=["mast"], imud="0.2.0"))
+    assert query(database, "SELECT version, devices, mqtt FROM imud_gateways") == [("0.2.0", ["mast"], {"sent": 3})]
 
 
 @pytest.mark.parametrize("from_begin", [False, True])
