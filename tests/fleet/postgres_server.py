@@ -22,13 +22,27 @@ NO_POSTGRES: Final = (
     else "" if find_spec("psycopg") else "psycopg is not installed (pip install 'imud[fleet]')"
 )  # fmt: skip
 
+_CONTROL: Final = "extension/timescaledb.control"  # below the folder of shared files
+
+
+def _has_timescale() -> bool:
+    if BIN is None:
+        return False
+    done = subprocess.run([BIN / "pg_config", "--sharedir"], capture_output=True, text=True, check=False)
+    return (Path(done.stdout.strip()) / _CONTROL).exists()
+
+
+NO_TIMESCALE: Final = NO_POSTGRES or ("" if _has_timescale() else "TimescaleDB is not installed")
+
 
 class PostgresServer:
     """Server process with its own data folder. Synchronization: one thread."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, libraries: str = "") -> None:
+        """Create the data folder. `libraries` is the value of `shared_preload_libraries`."""
         self.url = f"postgresql:///postgres?host={folder}&user=imud"
         self._folder = folder
+        self._libraries = libraries
         self._runs = False
         root = os.geteuid() == 0
         self._before = ["setpriv", "--reuid=postgres", "--regid=postgres", "--clear-groups"] if root else []
@@ -38,7 +52,9 @@ class PostgresServer:
 
     def start(self) -> None:
         """Start the server and wait for a reply. After `kill`, it recovers from its log."""
-        options = f"-k {self._folder} -c listen_addresses='' -c fsync=off"
+        options = (
+            f"-k {self._folder} -c listen_addresses='' -c fsync=off -c shared_preload_libraries='{self._libraries}'"
+        )
         self._call("pg_ctl", "-l", str(self._folder / "log"), "-w", "-t", str(LIMIT_S), "-o", options, "start")
         self._runs = True
 
@@ -58,10 +74,10 @@ class PostgresServer:
 
 
 @contextmanager
-def running_server() -> Iterator[PostgresServer]:
+def running_server(libraries: str = "") -> Iterator[PostgresServer]:
     folder = Path(tempfile.mkdtemp(prefix="imud-pg-", dir="/tmp"))  # other users cannot read tmp_path
     try:
-        server = PostgresServer(folder)
+        server = PostgresServer(folder, libraries)
         server.start()
         try:
             yield server

@@ -3,6 +3,7 @@
     imud_samples, imud_intervals, imud_events, imud_dropped     rows with a time, removed by age
     imud_gateways, imud_boots, imud_ledger                      state and ledger, one row per gateway, boot and stream
     imud_rejected                                               messages that the database could not store
+    imud_schema                                                 version of the tables
     imud_streams, imud_gateway_status                           views
     imud_intervals_1h, imud_intervals_1d                        views, or continuous aggregates of TimescaleDB
 
@@ -144,7 +145,7 @@ SAMPLES: Final = FleetTable(
         Column("position_quality", "bigint", "quality of the position as sent; 0: invalid"),
         Column("satellites", "bigint", "number of satellites in the position solution"),
     ),
-    ("gateway", "boot", "device", "seq", "time"),
+    ("gateway", "boot", "device", "seq", "time", "utc_set"),
     is_by_time=True,
 )
 _MEANINGS: Final = {"mean": "mean", "min": "minimum", "max": "maximum", "rms": "root mean square"}
@@ -169,7 +170,7 @@ INTERVALS: Final = FleetTable(
             for measure in MEASURES
         ),
     ),
-    ("gateway", "boot", "device", "stream", "first", "last", "time"),
+    ("gateway", "boot", "device", "stream", "first", "last", "time", "utc_set"),
     is_by_time=True,
 )
 EVENTS: Final = FleetTable(
@@ -183,7 +184,7 @@ EVENTS: Final = FleetTable(
         Column("message", "text NOT NULL", "text for people"),
         Column("details", "jsonb", "further values of the event, by name"),
     ),
-    ("gateway", "boot", "device", "number", "time"),
+    ("gateway", "boot", "device", "number", "time", "utc_set"),
     is_by_time=True,
 )
 DROPPED: Final = FleetTable(
@@ -197,7 +198,7 @@ DROPPED: Final = FleetTable(
         Column("cause", "text NOT NULL", "queue, space, age, disk, off or damaged"),
         _T_NS._replace(type="bigint"),
     ),
-    ("gateway", "boot", "device", "stream", "first", "last", "time"),
+    ("gateway", "boot", "device", "stream", "first", "last", "time", "utc_set"),
     is_by_time=True,
 )
 GATEWAYS: Final = FleetTable(
@@ -267,5 +268,11 @@ REJECTED: Final = FleetTable(
     ),
     (),
 )
+SCHEMA: Final = FleetTable(
+    "imud_schema",
+    "version of the tables and views",
+    (Column("version", "integer NOT NULL", "version; imud refuses tables of another version"),),
+    ("version",),
+)
 TIMED: Final = (SAMPLES, INTERVALS, EVENTS, DROPPED)
-TABLES: Final = (*TIMED, GATEWAYS, BOOTS, LEDGER, REJECTED)
+TABLES: Final = (*TIMED, GATEWAYS, BOOTS, LEDGER, REJECTED, SCHEMA)

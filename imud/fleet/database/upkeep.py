@@ -1,25 +1,490 @@
-"""Tables of the fleet database: creation and removal of old rows."""
+"""Upkeep of the fleet database: tables, partitions, removal of old rows and boots.
 
-from typing import Any
+    imud_samples ─┬─ imud_samples_unset                              rows without a known time (utc_set is false)
+                  └─ imud_samples_set ─┬─ imud_samples_20261128_00   rows of one day
+                                       ├─ …
+                                       └─ imud_samples_other         all other times
+
+Retention drops whole partitions. Only the end of its boot removes a row without a known time: its wrong time can be
+older than the retention, and the row gets its UTC time later. With TimescaleDB, each of these tables is a hypertable.
+
+Several collectors use one database. Each step of the upkeep is a short transaction under one advisory lock. A step
+waits at most LOCK_MS for a lock of a table, because collectors wait behind it.
+"""
+
+import logging
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from datetime import UTC, datetime, timedelta
+from functools import partial
+from typing import Any, Final, NamedTuple
 
 from imud.fleet.database.settings import CollectorSettings
-from imud.fleet.database.tables import TABLES
+from imud.fleet.database.tables import (
+    BOOTS,
+    GATEWAYS,
+    INTERVALS,
+    LEDGER,
+    REJECTED,
+    SAMPLES,
+    SCHEMA,
+    SCHEMA_VERSION,
+    TABLES,
+    TIMED,
+    FleetTable,
+)
+from imud.model.errors import ServerError
+
+log = logging.getLogger(__name__)
+
+_LOCK: Final = 0x696D7564_75706B70  # number of the advisory lock, "imudupkp"
+PREPARE_S: Final = 20  # maximum wait for another collector that creates the tables, s
+LOCK_MS: Final = 1000  # Maximum wait for a lock of a table, ms. Collectors wait for the same time.
+STATEMENT_S: Final = 60  # maximum time of a statement, s
+ROWS_STEP: Final = 10_000  # maximum number of rows that a step deletes
+STEPS_MAX: Final = 100  # Maximum number of steps of each kind in one run. The next run continues.
+BOOTS_STEP: Final = 100  # maximum number of boots that a step removes
+REJECTED_MAX: Final = 10_000  # number of rejected messages that stay
+SILENT_DAYS: Final = 7  # time without a message after which imud removes a boot with missing numbers, days
+AHEAD: Final = 2  # number of partitions after the present partition
+# Age of the oldest partition of a new database, hours. The spool of a gateway keeps messages for this time by default.
+BEHIND_H: Final = 168
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+# First version of TimescaleDB that can delete compressed rows
+_TIMESCALE_MIN: Final = (2, 11)
+# Columns that identify the stream of a row; TimescaleDB compresses the rows of one stream together
+_OF_STREAM: Final = ("gateway", "boot", "device", "stream", "utc_set")
+
+
+class _Partition(NamedTuple):
+    """Partition, or chunk of a hypertable."""
+
+    name: str  # with schema and quotes as SQL requires
+    begin: datetime
+    end: datetime  # first time after the partition
 
 
 class Upkeep:
-    """Creation and upkeep of the tables. Synchronization: one thread."""
+    """Tables of one database, with the removal of old rows. Synchronization: one thread."""
 
     def __init__(self, settings: CollectorSettings) -> None:
+        self.dropped_partitions = 0  # number of partitions that this collector removed
+        self.expired_boots = 0  # number of boots that this collector removed from the ledger
+        self.expired_incomplete = 0  # number of removed boots with missing numbers
         self._settings = settings
+        self._reported: set[str] = set()
 
-    def prepare(self, cursor: Any) -> None:
-        """Create missing tables. Without a missing table, the user needs no right to create tables."""
-        cursor.execute("SELECT pg_advisory_xact_lock(hashtextextended('imud tables', 0))")
-        for table in TABLES:
-            cursor.execute("SELECT to_regclass(%s)", (table.name,))
-            if cursor.fetchone()[0] is None:
-                for statement in table.statements():
-                    cursor.execute(statement)
+    # --- start --------------------------------------------------------------------------------------------------------
 
-    def run(self, cursor: Any) -> None:
-        """Do nothing yet."""
+    def prepare(self, cursor: Any, now: datetime | None = None) -> None:
+        """Create missing tables, partitions and views in the transaction of `cursor`. If all tables exist, the user
+        needs no right to create tables. `now` is the present time; None: the clock of the database. Raises ServerError
+        for tables of another version."""
+        cursor.execute(f"SET LOCAL lock_timeout = '{PREPARE_S}s'; SET LOCAL timezone = 'UTC'")
+        cursor.execute("SELECT pg_advisory_xact_lock(%s)", (_LOCK,))
+        _check_version(cursor)
+        missing = [table for table in TABLES if not _exists(cursor, table.name)]
+        with_timescale = _has_timescale(cursor, is_wanted=any(table.is_by_time for table in missing))
+        for table in missing:
+            _create(cursor, table, with_timescale=with_timescale)
+        if SCHEMA in missing:
+            cursor.execute(f"INSERT INTO {SCHEMA.name} (version) VALUES (%s)", (SCHEMA_VERSION,))
+        now = now or _now(cursor)
+        for table in TIMED:
+            if _is_hypertable(cursor, table):
+                self._guarded(cursor, f"set the chunks of {table.name}", partial(self._tune, table, cursor))
+            else:
+                self._guarded(
+                    cursor, f"create partitions of {table.name}", partial(self._extend_all, table, cursor, now)
+                )
+        if with_timescale:
+            # the UTC time of a boot can change more compressed rows than the default limit, 100,000
+            cursor.execute("SET timescaledb.max_tuples_decompressed_per_dml_transaction = 0")
+
+    def _extend_all(self, table: FleetTable, cursor: Any, now: datetime) -> None:
+        while self._extend(table, cursor, now):
+            pass
+
+    def _tune(self, table: FleetTable, cursor: Any) -> None:
+        """Set the width of new chunks and the compression of a hypertable."""
+        width = timedelta(hours=self._settings.partition_hours)
+        cursor.execute("SELECT set_chunk_time_interval(%s::regclass, %s)", (table.name, width))
+        if not _has_license(cursor):
+            return
+        days = self._settings.compress_after_days
+        after = None if days is None else timedelta(days=days)
+        cursor.execute(
+            "SELECT (config->>'compress_after')::interval FROM timescaledb_information.jobs "
+            "WHERE config ? 'compress_after' AND format('%%I.%%I', hypertable_schema, hypertable_name)::regclass "
+            "= %s::regclass",
+            (table.name,),
+        )
+        if [row[0] for row in cursor] == ([] if after is None else [after]):
+            return
+        cursor.execute("SELECT remove_compression_policy(%s::regclass, if_exists => true)", (table.name,))
+        if after is not None:
+            cursor.execute("SELECT add_compression_policy(%s::regclass, %s::interval)", (table.name, after))
+
+    # --- every minute -------------------------------------------------------------------------------------------------
+
+    def run(self, cursor: Any, now: datetime | None = None) -> None:
+        """Create partitions, and remove old partitions, boots and rejected messages. Call it outside a transaction.
+        `now` is the present time; None: the clock of the database. Do nothing while another collector does this work.
+        Raises psycopg.Error only if the connection is lost. Other problems are in the log, each once."""
+        for name, step in self._steps():
+            for _ in range(STEPS_MAX):
+                if not self._guarded(cursor, name, partial(self._locked, cursor, step, now)):
+                    break
+
+    def _steps(self) -> Iterator[tuple[str, Callable[[Any, datetime], bool]]]:
+        """Yield the name and the function of each kind of work. The function returns whether more work is left."""
+        for table in TIMED:
+            yield f"create partitions of {table.name}", partial(self._extend, table)
+            yield f"remove old rows of {table.name}", partial(self._retain, table)
+        yield "remove old boots", self._expire
+        yield f"remove old rows of {REJECTED.name}", _limit_rejected
+
+    def _locked(self, cursor: Any, step: Callable[[Any, datetime], bool], now: datetime | None) -> bool:
+        """Run a step if no other collector runs one. Return whether more work is left."""
+        cursor.execute(
+            f"SET LOCAL lock_timeout = '{LOCK_MS}ms'; SET LOCAL statement_timeout = '{STATEMENT_S}s'; "
+            "SET LOCAL timezone = 'UTC'"
+        )
+        cursor.execute("SELECT pg_try_advisory_xact_lock(%s)", (_LOCK,))
+        return bool(cursor.fetchone()[0]) and step(cursor, now or _now(cursor))
+
+    def _guarded(self, cursor: Any, name: str, work: Callable[[], Any]) -> bool:
+        """Do work in a transaction. Return its result; False after an error of the database, which goes to the log."""
+        import psycopg
+
+        try:
+            with cursor.connection.transaction():
+                return bool(work())
+        except psycopg.Error as error:
+            if cursor.connection.closed:
+                raise
+            reason = " ".join(str(error).split())
+            advice = ""
+            if isinstance(error, psycopg.errors.InsufficientPrivilege):
+                advice = "; run a collector as the owner of the table"
+            text = f"PostgreSQL: cannot {name}: {reason}{advice}"
+            is_busy = isinstance(error, psycopg.errors.LockNotAvailable | psycopg.errors.DeadlockDetected)
+            if text not in self._reported and not is_busy:
+                log.warning("%s", text)
+                self._reported.add(text)
+            return False
+
+    # --- partitions ---------------------------------------------------------------------------------------------------
+
+    def _cut(self, table: FleetTable, now: datetime) -> datetime | None:
+        """Return the oldest time of rows that stay; None: all rows stay."""
+        settings = self._settings
+        days = {SAMPLES.name: settings.samples_days, INTERVALS.name: settings.intervals_days}.get(
+            table.name, settings.events_days
+        )
+        return None if days is None else now - timedelta(days=days)
+
+    def _extend(self, table: FleetTable, cursor: Any, now: datetime) -> bool:
+        """Create one missing partition. Return whether there was one."""
+        if not _is_partitioned(cursor, table):
+            return False
+        width, cut = timedelta(hours=self._settings.partition_hours), self._cut(table, now)
+        present = _EPOCH + (now - _EPOCH) // width * width
+        begin = present - timedelta(hours=BEHIND_H) // width * width
+        known = _partitions(cursor, table)
+        for low, high in _free(begin, present + (AHEAD + 1) * width, width, known):
+            if cut is None or high > cut:
+                _add_partition(cursor, table, low, high)
+                return True
+        return False
+
+    def _retain(self, table: FleetTable, cursor: Any, now: datetime) -> bool:
+        """Remove one old partition, or some old rows. Return whether more can be left."""
+        cut = self._cut(table, now)
+        if cut is None:
+            return False
+        if _is_hypertable(cursor, table):
+            return self._retain_chunk(cursor, table, cut)
+        if not _is_partitioned(cursor, table):
+            return False
+        for one in _partitions(cursor, table):
+            if one.end <= cut:
+                cursor.execute(f"DROP TABLE {one.name}")
+                self.dropped_partitions += 1
+                return True
+        return _delete(cursor, f"{table.name}_other", "time < %(cut)s", {"cut": cut})
+
+    def _retain_chunk(self, cursor: Any, table: FleetTable, cut: datetime) -> bool:
+        """Drop one old chunk. If it contains rows without a known time, delete a part of its other rows."""
+        for one in _chunks(cursor, table, cut):
+            cursor.execute(f"LOCK TABLE {one.name} IN ACCESS EXCLUSIVE MODE")
+            cursor.execute(f"SELECT EXISTS (SELECT FROM {one.name} WHERE NOT utc_set)")
+            if not cursor.fetchone()[0]:
+                cursor.execute(
+                    "SELECT drop_chunks(%s::regclass, older_than => %s::timestamptz, newer_than => %s::timestamptz)",
+                    (table.name, one.end, one.begin),
+                )
+                self.dropped_partitions += 1
+                return True
+            cursor.execute(
+                f"SELECT min(time) FROM {table.name} WHERE time >= %s AND time < %s AND utc_set", (one.begin, one.end)
+            )
+            oldest = cursor.fetchone()[0]
+            if oldest is not None:
+                high = min(one.end, oldest + (one.end - one.begin) / 24)
+                cursor.execute(f"DELETE FROM {table.name} WHERE time >= %s AND time < %s AND utc_set", (oldest, high))
+                return True
+        return False
+
+    # --- boots --------------------------------------------------------------------------------------------------------
+
+    def _expire(self, cursor: Any, now: datetime) -> bool:
+        """Remove some boots of gateways with more than `keep_boots` boots. Return whether more can be left."""
+        found = self._old_boots(cursor, now)
+        if not found:
+            return False
+        keys = {"gateways": [gateway for gateway, _ in found], "boots": [boot for _, boot in found]}
+        chosen = "IN (SELECT * FROM unnest(%(gateways)s::text[], %(boots)s::text[]))"
+        cursor.execute(
+            f"SELECT FROM {BOOTS.name} WHERE (gateway, boot) {chosen} ORDER BY gateway, boot FOR UPDATE", keys
+        )
+        cursor.execute(
+            f"SELECT gateway, boot FROM {LEDGER.name} WHERE (gateway, split_part(boot, '-', 1)) {chosen} "
+            "ORDER BY gateway, boot, device, stream FOR UPDATE", keys,
+        )  # fmt: skip
+        names = {*cursor, *found}  # also boots with -2, -3 …
+        # a collector can have stored a message before the lock
+        if self._old_boots(cursor, now).keys() != found.keys():
+            return True
+        if sum(
+            _delete_unset(cursor, table, names) for table in TIMED
+        ):  # without any(): each table, also after the first
+            return True
+        cursor.execute(f"DELETE FROM {LEDGER.name} WHERE (gateway, split_part(boot, '-', 1)) {chosen}", keys)
+        cursor.execute(f"DELETE FROM {BOOTS.name} WHERE (gateway, boot) {chosen}", keys)
+        incomplete = sum(not is_complete for is_complete in found.values())
+        self.expired_boots += len(found)
+        self.expired_incomplete += incomplete
+        log.info("PostgreSQL: removed %d old boots, %d of them with missing numbers", len(found), incomplete)
+        return len(found) == BOOTS_STEP
+
+    def _old_boots(self, cursor: Any, now: datetime) -> dict[tuple[str, str], bool]:
+        """Return gateway and boot of boots to remove, and whether all numbers of the boot arrived."""
+        cursor.execute(
+            "WITH streams AS (SELECT gateway, split_part(boot, '-', 1) AS boot, max(updated_at) AS updated_at, "
+            f"bool_and(missing = 0 AND coalesce(sent, newest) <= newest) AS complete FROM {LEDGER.name} "
+            "GROUP BY 1, 2), known AS (SELECT gateway, boot, coalesce(complete, true) AS complete, "
+            "greatest(first_at, updated_at) AS newest_at, row_number() OVER (PARTITION BY gateway "
+            "ORDER BY coalesce(first_at, updated_at) DESC, boot DESC) AS position "
+            f"FROM {BOOTS.name} FULL JOIN streams USING (gateway, boot)) "
+            "SELECT gateway, boot, complete FROM known WHERE position > %s AND (complete OR newest_at < %s) "
+            f"AND NOT EXISTS (SELECT FROM {GATEWAYS.name} AS state WHERE state.gateway = known.gateway "
+            "AND split_part(state.boot, '-', 1) = known.boot) ORDER BY gateway, boot LIMIT %s",
+            (self._settings.keep_boots, now - timedelta(days=SILENT_DAYS), BOOTS_STEP),
+        )
+        return {(gateway, boot): complete for gateway, boot, complete in cursor}
+
+
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+
+def _now(cursor: Any) -> datetime:
+    cursor.execute("SELECT now()")
+    found: datetime = cursor.fetchone()[0]
+    return found
+
+
+def _exists(cursor: Any, name: str) -> bool:
+    cursor.execute("SELECT to_regclass(%s) IS NOT NULL", (name,))
+    return bool(cursor.fetchone()[0])
+
+
+def _check_version(cursor: Any) -> None:
+    """Raise ServerError if the tables have another version."""
+    cursor.execute(
+        "SELECT attrelid::regclass::text FROM pg_attribute WHERE NOT attisdropped "
+        "AND attname IN ('account', 'content') "
+        "AND attrelid IN (to_regclass('imud_ledger'), to_regclass('imud_records'))"
+    )
+    old = cursor.fetchone()
+    if old is not None:
+        raise ServerError(
+            f"PostgreSQL: expected tables of version {SCHEMA_VERSION}, got {old[0]} of a development version of imud; "
+            "move the old tables to another schema (ALTER SCHEMA public RENAME TO imud_old; CREATE SCHEMA public) or "
+            "use another database"
+        )
+    if _exists(cursor, SCHEMA.name):
+        cursor.execute(f"SELECT max(version) FROM {SCHEMA.name}")
+        version = cursor.fetchone()[0]
+        if version != SCHEMA_VERSION:
+            raise ServerError(
+                f"PostgreSQL: expected tables of version {SCHEMA_VERSION}, got version {version}; install the version "
+                "of imud that created them or use another database"
+            )
+
+
+def _create(cursor: Any, table: FleetTable, *, with_timescale: bool) -> None:
+    """Create a table with its partitions or as a hypertable."""
+    is_partitioned = table.is_by_time and not with_timescale
+    made = table._replace(options=" PARTITION BY LIST (utc_set)") if is_partitioned else table
+    for statement in made.statements():
+        cursor.execute(statement)
+    if not table.is_by_time:
+        return
+    # rows arrive almost in the order of their time: an index of ranges is small and makes queries by time fast
+    cursor.execute(f"CREATE INDEX ON {table.name} USING brin (time) WITH (autosummarize = on)")
+    name = table.name
+    if is_partitioned:
+        cursor.execute(f"CREATE TABLE {name}_unset PARTITION OF {name} FOR VALUES IN (false)")
+        cursor.execute(f"CREATE TABLE {name}_set PARTITION OF {name} FOR VALUES IN (true) PARTITION BY RANGE (time)")
+        cursor.execute(f"CREATE TABLE {name}_other PARTITION OF {name}_set DEFAULT")
+        cursor.execute(f"CREATE INDEX ON {name}_other (time)")
+        return
+    cursor.execute("SELECT create_hypertable(%s::regclass, 'time'::name, create_default_indexes => false)", (name,))
+    cursor.execute(f"CREATE INDEX ON {name} (gateway, boot) WHERE NOT utc_set")
+    if _has_license(cursor):
+        segments = ", ".join(one for one in table.primary if one in _OF_STREAM)
+        order = ", ".join(["time", *(one for one in table.primary if one not in (*_OF_STREAM, "time"))])
+        cursor.execute(
+            f"ALTER TABLE {name} SET (timescaledb.compress, timescaledb.compress_segmentby = '{segments}', "
+            f"timescaledb.compress_orderby = '{order}')"
+        )
+
+
+# --- TimescaleDB ------------------------------------------------------------------------------------------------------
+
+
+def _has_timescale(cursor: Any, *, is_wanted: bool) -> bool:
+    """Return whether the database contains TimescaleDB. If it is wanted, try to create the extension."""
+    import psycopg
+
+    cursor.execute("SELECT installed_version, default_version FROM pg_available_extensions WHERE name = 'timescaledb'")
+    installed, available = cursor.fetchone() or (None, None)
+    version = installed or available
+    if version is None or tuple(map(int, version.split("-")[0].split(".")[:2])) < _TIMESCALE_MIN:
+        return False
+    if installed is not None or not is_wanted:
+        return installed is not None
+    # without shared_preload_libraries, CREATE EXTENSION ends the connection; only the library defines this parameter
+    cursor.execute("SELECT current_setting('timescaledb.disable_load', true)")
+    if cursor.fetchone()[0] is None:
+        return False
+    try:
+        with cursor.connection.transaction():
+            cursor.execute("CREATE EXTENSION timescaledb")
+    except psycopg.Error as error:
+        log.info("PostgreSQL: without TimescaleDB: %s", " ".join(str(error).split()))
+        return False
+    return True
+
+
+def _has_license(cursor: Any) -> bool:
+    """Return whether the license of TimescaleDB allows compression and continuous aggregates."""
+    cursor.execute("SELECT current_setting('timescaledb.license', true)")
+    return bool(cursor.fetchone()[0] == "timescale")
+
+
+def _is_hypertable(cursor: Any, table: FleetTable) -> bool:
+    if not _exists(cursor, "timescaledb_information.hypertables"):
+        return False
+    cursor.execute(
+        "SELECT count(*) > 0 FROM timescaledb_information.hypertables WHERE "
+        "format('%%I.%%I', hypertable_schema, hypertable_name)::regclass = to_regclass(%s)", (table.name,),
+    )  # fmt: skip
+    return bool(cursor.fetchone()[0])
+
+
+def _chunks(cursor: Any, table: FleetTable, cut: datetime) -> Sequence[_Partition]:
+    """Return the chunks that end before `cut`, oldest first."""
+    cursor.execute(
+        "SELECT format('%%I.%%I', chunk_schema, chunk_name), range_start, range_end "
+        "FROM timescaledb_information.chunks WHERE "
+        "format('%%I.%%I', hypertable_schema, hypertable_name)::regclass = to_regclass(%s) AND range_end <= %s "
+        "ORDER BY range_start", (table.name, cut),
+    )  # fmt: skip
+    return [_Partition(*row) for row in cursor]
+
+
+# --- partitions -------------------------------------------------------------------------------------------------------
+
+
+def _is_partitioned(cursor: Any, table: FleetTable) -> bool:
+    return _exists(cursor, f"{table.name}_set")
+
+
+def _partitions(cursor: Any, table: FleetTable) -> Sequence[_Partition]:
+    """Return the partitions of a table, oldest first."""
+    cursor.execute(
+        "SELECT inhrelid::regclass::text, bounds[1]::timestamptz, bounds[2]::timestamptz FROM pg_inherits "
+        "JOIN pg_class ON pg_class.oid = inhrelid, "
+        r"regexp_match(pg_get_expr(relpartbound, inhrelid), $$FROM \('(.+)'\) TO \('(.+)'\)$$) AS bounds "
+        "WHERE inhparent = %s::regclass AND bounds IS NOT NULL ORDER BY 2", (f"{table.name}_set",),
+    )  # fmt: skip
+    return [_Partition(*row) for row in cursor]
+
+
+def _free(
+    begin: datetime, end: datetime, width: timedelta, known: Iterable[_Partition]
+) -> Iterator[tuple[datetime, datetime]]:
+    """Yield the ranges from `begin` to `end` that no partition covers, divided at multiples of `width`."""
+    while begin < end:
+        high = begin + width
+        low = begin
+        for one in known:
+            if one.begin < high and low < one.end:
+                if low < one.begin:
+                    yield low, one.begin
+                low = one.end
+        if low < high:
+            yield low, high
+        begin = high
+
+
+def _add_partition(cursor: Any, table: FleetTable, low: datetime, high: datetime) -> None:
+    """Create a partition and move its rows out of the partition of all other times."""
+    parent, other = f"{table.name}_set", f"{table.name}_other"
+    cursor.execute("SELECT relnamespace::regnamespace::text FROM pg_class WHERE oid = %s::regclass", (parent,))
+    name = f"{cursor.fetchone()[0]}.{table.name}_{low:%Y%m%d_%H}"
+    cursor.execute(f"LOCK TABLE {other} IN ACCESS EXCLUSIVE MODE")
+    cursor.execute(f"CREATE TABLE {name} (LIKE {parent} INCLUDING ALL)")
+    cursor.execute(
+        f"WITH moved AS (DELETE FROM {other} WHERE time >= %s AND time < %s RETURNING *) "
+        f"INSERT INTO {name} SELECT * FROM moved", (low, high),
+    )  # fmt: skip
+    bounds = f"FROM ('{low.isoformat()}') TO ('{high.isoformat()}')"
+    cursor.execute(f"ALTER TABLE {parent} ATTACH PARTITION {name} FOR VALUES {bounds}")
+
+
+# --- rows -------------------------------------------------------------------------------------------------------------
+
+
+def _delete(cursor: Any, name: str, condition: str, values: dict[str, Any]) -> bool:
+    """Delete at most ROWS_STEP rows of a table without partitions. Return whether more can be left."""
+    cursor.execute(
+        f"DELETE FROM {name} WHERE ctid = ANY(ARRAY(SELECT ctid FROM {name} WHERE {condition} LIMIT {ROWS_STEP}))",
+        values,
+    )
+    return bool(cursor.rowcount == ROWS_STEP)
+
+
+def _delete_unset(cursor: Any, table: FleetTable, names: Iterable[tuple[str, str]]) -> bool:
+    """Delete rows of boots without a known time. Return whether more can be left."""
+    condition = "gateway = ANY(%(gateways)s) AND boot = ANY(%(boots)s) AND gateway || '/' || boot = ANY(%(keys)s)"
+    names = sorted(names)
+    values = {
+        "gateways": sorted({gateway for gateway, _ in names}), "boots": sorted({boot for _, boot in names}),
+        "keys": ["/".join(name) for name in names],
+    }  # fmt: skip
+    if _is_partitioned(cursor, table):
+        return _delete(cursor, f"{table.name}_unset", condition, values)
+    # TimescaleDB cannot select compressed rows by ctid
+    cursor.execute(f"DELETE FROM {table.name} WHERE {condition} AND NOT utc_set", values)
+    return False
+
+
+def _limit_rejected(cursor: Any, _now: datetime) -> bool:
+    """Delete some rejected messages before the newest REJECTED_MAX. Return whether more can be left."""
+    cursor.execute(
+        f"DELETE FROM {REJECTED.name} WHERE id IN "
+        f"(SELECT id FROM {REJECTED.name} ORDER BY id DESC OFFSET {REJECTED_MAX} LIMIT {ROWS_STEP})"
+    )
+    return bool(cursor.rowcount == ROWS_STEP)
