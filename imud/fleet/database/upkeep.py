@@ -255,9 +255,7 @@ class Upkeep:
         # a collector can have stored a message before the lock
         if self._old_boots(cursor, now).keys() != found.keys():
             return True
-        if sum(
-            _delete_unset(cursor, table, names) for table in TIMED
-        ):  # without any(): each table, also after the first
+        if any(_delete_unset(cursor, table, names) for table in TIMED):
             return True
         cursor.execute(f"DELETE FROM {LEDGER.name} WHERE (gateway, split_part(boot, '-', 1)) {chosen}", keys)
         cursor.execute(f"DELETE FROM {BOOTS.name} WHERE (gateway, boot) {chosen}", keys)
@@ -445,7 +443,7 @@ def _add_partition(cursor: Any, table: FleetTable, low: datetime, high: datetime
     cursor.execute("SELECT relnamespace::regnamespace::text FROM pg_class WHERE oid = %s::regclass", (parent,))
     name = f"{cursor.fetchone()[0]}.{table.name}_{low:%Y%m%d_%H}"
     cursor.execute(f"LOCK TABLE {other} IN ACCESS EXCLUSIVE MODE")
-    cursor.execute(f"CREATE TABLE {name} (LIKE {parent} INCLUDING ALL)")
+    cursor.execute(f"CREATE TABLE {name} (LIKE {parent} INCLUDING ALL EXCLUDING COMMENTS)")
     cursor.execute(
         f"WITH moved AS (DELETE FROM {other} WHERE time >= %s AND time < %s RETURNING *) "
         f"INSERT INTO {name} SELECT * FROM moved", (low, high),
