@@ -10,7 +10,7 @@
 Each physical value has a column of its own. The name of the column ends in the unit. All columns have a comment.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Final, NamedTuple
 
 from imud.fleet.statistics import MEASURES, SCALARS, VECTORS
@@ -90,9 +90,14 @@ class FleetTable(NamedTuple):
         columns = ", ".join(f"{one.name} {one.type}" for one in self.columns)
         key = f", PRIMARY KEY ({', '.join(self.primary)})" if self.primary else ""
         yield f"CREATE TABLE {self.name} ({columns}{key}){self.options}"
-        yield f"COMMENT ON TABLE {self.name} IS {_quoted(self.comment)}"
-        for one in self.columns:
-            yield f"COMMENT ON COLUMN {self.name}.{one.name} IS {_quoted(one.comment)}"
+        yield from comments("TABLE", self.name, self.comment, self.columns)
+
+
+def comments(kind: str, name: str, comment: str, columns: Iterable[Column]) -> Iterator[str]:
+    """Yield the statements that comment a table or a view (`kind`) and its columns."""
+    yield f"COMMENT ON {kind} {name} IS {_quoted(comment)}"
+    for one in columns:
+        yield f"COMMENT ON COLUMN {name}.{one.name} IS {_quoted(one.comment)}"
 
 
 def _quoted(text: str) -> str:
@@ -148,7 +153,7 @@ SAMPLES: Final = FleetTable(
     ("gateway", "boot", "device", "seq", "time", "utc_set"),
     is_by_time=True,
 )
-_MEANINGS: Final = {"mean": "mean", "min": "minimum", "max": "maximum", "rms": "root mean square"}
+MEANINGS: Final = {"mean": "mean", "min": "minimum", "max": "maximum", "rms": "root mean square"}
 INTERVALS: Final = FleetTable(
     "imud_intervals",
     "statistics of intervals, one row per device and interval",
@@ -165,7 +170,7 @@ INTERVALS: Final = FleetTable(
         _SYNC,
         Column("status", "bigint", "bitwise OR of the status bits of all samples"),
         *(
-            Column(one.column(measure), "double precision", f"{_MEANINGS[measure]} of: {one.comment}")
+            Column(one.column(measure), "double precision", f"{MEANINGS[measure]} of: {one.comment}")
             for one in COMPONENTS
             for measure in MEASURES
         ),
