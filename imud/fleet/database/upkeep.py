@@ -32,6 +32,7 @@ from imud.fleet.database.tables import (
     TIMED,
     FleetTable,
 )
+from imud.fleet.database.views import refresh_policies, views
 from imud.model.errors import ServerError
 
 log = logging.getLogger(__name__)
@@ -88,14 +89,22 @@ class Upkeep:
             _create(cursor, table, with_timescale=with_timescale)
         if SCHEMA in missing:
             cursor.execute(f"INSERT INTO {SCHEMA.name} (version) VALUES (%s)", (SCHEMA_VERSION,))
+        has_aggregates = _is_hypertable(cursor, INTERVALS) and _has_license(cursor)
+        for view in views(with_timescale=has_aggregates):
+            if not _exists(cursor, view.name):
+                _execute(cursor, view.statements())
         now = now or _now(cursor)
         for table in TIMED:
             if _is_hypertable(cursor, table):
                 self._guarded(cursor, f"set the chunks of {table.name}", partial(self._tune, table, cursor))
+            elif _is_partitioned(cursor, table):
+                name = f"create partitions of {table.name}"
+                self._guarded(cursor, name, partial(self._extend_all, table, cursor, now))
             else:
-                self._guarded(
-                    cursor, f"create partitions of {table.name}", partial(self._extend_all, table, cursor, now)
-                )
+                self._report(f"cannot remove old rows of {table.name}: expected partitions, got a plain table")
+        if has_aggregates:
+            policies = refresh_policies(self._settings.intervals_days)
+            self._guarded(cursor, "set the refresh of hours and days", partial(_execute, cursor, policies))
         if with_timescale:
             # the UTC time of a boot can change more compressed rows than the default limit, 100,000
             cursor.execute("SET timescaledb.max_tuples_decompressed_per_dml_transaction = 0")
@@ -166,12 +175,15 @@ class Upkeep:
             advice = ""
             if isinstance(error, psycopg.errors.InsufficientPrivilege):
                 advice = "; run a collector as the owner of the table"
-            text = f"PostgreSQL: cannot {name}: {reason}{advice}"
-            is_busy = isinstance(error, psycopg.errors.LockNotAvailable | psycopg.errors.DeadlockDetected)
-            if text not in self._reported and not is_busy:
-                log.warning("%s", text)
-                self._reported.add(text)
+            if not isinstance(error, psycopg.errors.LockNotAvailable | psycopg.errors.DeadlockDetected):
+                self._report(f"cannot {name}: {reason}{advice}")
             return False
+
+    def _report(self, text: str) -> None:
+        """Log a problem once."""
+        if text not in self._reported:
+            self._reported.add(text)
+            log.warning("PostgreSQL: %s", text)
 
     # --- partitions ---------------------------------------------------------------------------------------------------
 
@@ -291,6 +303,11 @@ def _now(cursor: Any) -> datetime:
     return found
 
 
+def _execute(cursor: Any, statements: Iterable[str]) -> None:
+    for one in statements:
+        cursor.execute(one)
+
+
 def _exists(cursor: Any, name: str) -> bool:
     cursor.execute("SELECT to_regclass(%s) IS NOT NULL", (name,))
     return bool(cursor.fetchone()[0])
@@ -324,8 +341,7 @@ def _create(cursor: Any, table: FleetTable, *, with_timescale: bool) -> None:
     """Create a table with its partitions or as a hypertable."""
     is_partitioned = table.is_by_time and not with_timescale
     made = table._replace(options=" PARTITION BY LIST (utc_set)") if is_partitioned else table
-    for statement in made.statements():
-        cursor.execute(statement)
+    _execute(cursor, made.statements())
     if not table.is_by_time:
         return
     # rows arrive almost in the order of their time: an index of ranges is small and makes queries by time fast

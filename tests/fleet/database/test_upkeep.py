@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 
 from imud.fleet.database import upkeep
 from imud.fleet.database.settings import CollectorSettings
-from imud.fleet.database.tables import BOOTS, EVENTS, GATEWAYS, LEDGER, REJECTED, SAMPLES, TIMED, FleetTable
+from imud.fleet.database.tables import BOOTS, EVENTS, GATEWAYS, INTERVALS, LEDGER, REJECTED, SAMPLES, TIMED, FleetTable
 from imud.fleet.database.upkeep import Upkeep
 from imud.model.errors import ServerError
+from tests.fleet.database.fleet_rows import insert
 from tests.fleet.postgres_server import NO_POSTGRES, NO_TIMESCALE, running_server
 from tests.support.daemon_process import LIMIT_S
 
@@ -81,15 +82,10 @@ class Database:
         return made
 
     def add(self, table: FleetTable, **values: Any) -> None:
-        """Insert a row. Columns without a value are 0, empty or true."""
-        zero = {"text": "", "bigint": 0, "boolean": True, "timestamptz": NOW, "jsonb": "{}", "bytea": b""}
-        row = {
-            one.name: [] if "[]" in one.type else zero[one.type.split()[0]]
-            for one in table.columns
-            if "NOT NULL" in one.type and "DEFAULT" not in one.type
-        } | values
-        marks = ", ".join("%s" for _ in row)
-        self.query(f"INSERT INTO {table.name} ({', '.join(row)}) VALUES ({marks})", *row.values())
+        """Insert a row. The other columns have default values."""
+        with self.connection.transaction(), self.connection.cursor() as cursor:
+            times: dict[str, Any] = {name: NOW for name in ("time", "updated_at") if name in table.names}
+            insert(cursor, table, **(times | values))
 
     def times(self, table: FleetTable = SAMPLES) -> list[datetime]:
         self.query("SET timezone = 'UTC'")
@@ -164,7 +160,7 @@ def test_a_user_who_does_not_own_the_tables_gets_one_log_line(
 def test_retention_removes_exactly_the_old_partitions(database: Database, library: str) -> None:
     made = database.prepare(samples_days=3, events_days=2, compress_after_days=None)
     hours = [NOW - timedelta(hours=12 * n) for n in range(-4, 24)]
-    for table in (SAMPLES, EVENTS, upkeep.INTERVALS):
+    for table in (SAMPLES, EVENTS, INTERVALS):
         for time in hours:
             database.add(table, time=time)
     database.run(made)
@@ -172,7 +168,7 @@ def test_retention_removes_exactly_the_old_partitions(database: Database, librar
         # NOW - 3 days is 12 June 13:30: the partition of 12 June stays
         kept = sorted(one for one in hours if one >= datetime(2026, 6, day, tzinfo=UTC))
         assert database.times(table) == kept
-    assert len(database.times(upkeep.INTERVALS)) == len(hours), "without a retention, all rows stay"
+    assert len(database.times(INTERVALS)) == len(hours), "without a retention, all rows stay"
     database.run(made, NOW + 30 * DAY)
     assert database.times() == database.times(EVENTS) == []
     assert made.dropped_partitions >= 10
@@ -222,10 +218,10 @@ def test_rows_without_a_known_time_stay_until_their_boot_ends(database: Database
     database.add(SAMPLES, gateway="gw", boot="a", time=NOW, seq=8)
     database.run(made)
     rows = "SELECT boot, seq, count(*) FROM imud_samples GROUP BY 1, 2 ORDER BY 1, 2"
-    assert database.query(rows) == [("a", 0, 3), ("a", 8, 1), ("a-2", 0, 3), ("b", 0, 3), ("b-2", 0, 3)]
+    assert database.query(rows) == [("a", 1, 3), ("a", 8, 1), ("a-2", 1, 3), ("b", 1, 3), ("b-2", 1, 3)]
     database.query("UPDATE imud_ledger SET missing = 0")
     assert database.run(made).expired_boots == 1
-    assert database.query(rows) == [("a", 8, 1), ("b", 0, 3), ("b-2", 0, 3)]
+    assert database.query(rows) == [("a", 8, 1), ("b", 1, 3), ("b-2", 1, 3)]
 
 
 # --- boots ------------------------------------------------------------------------------------------------------------
@@ -248,7 +244,7 @@ def test_complete_boots_end_and_incomplete_boots_stay_for_a_week(database: Datab
             if values is not None:
                 database.add(LEDGER, gateway=gateway, boot=boot, device="bow", stream="samples", **values)
                 database.add(LEDGER, gateway=gateway, boot=f"{boot}-2", device="bow", stream="samples", **values)
-        database.add(GATEWAYS, gateway=gateway, boot="present-3", mqtt="{}")
+        database.add(GATEWAYS, gateway=gateway, boot="present-3")
     database.run(made)
     left = [boot for (boot,) in database.query("SELECT boot FROM imud_boots WHERE gateway = 'gw' ORDER BY first_at")]
     assert left == ["missing", "spooled", "present", "new1", "new2"]
@@ -459,7 +455,7 @@ def test_free_ranges_cover_each_hour_once(ranges: list[tuple[int, int]], width: 
             covered |= set(range(low, low + length))
     end = begin + hours // width * width
     found: list[int] = []
-    for low, high in upkeep._free(NOW + begin * hour, NOW + end * hour, width * hour, known):
-        assert timedelta() < high - low <= width * hour
-        found += range((low - NOW) // hour, (high - NOW) // hour)
+    for first, after in upkeep._free(NOW + begin * hour, NOW + end * hour, width * hour, known):
+        assert timedelta() < after - first <= width * hour
+        found += range((first - NOW) // hour, (after - NOW) // hour)
     assert sorted(found) == sorted(set(range(begin, end)) - covered)
