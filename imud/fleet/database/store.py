@@ -276,13 +276,12 @@ class PostgresStore:
         self.counts.rejected += len(invalid)
 
     def _run_upkeep(self) -> None:
-        """Do the upkeep of the tables. An error does not end the collector."""
+        """Do the upkeep of the tables, in transactions of its own. Raises ServerError if the connection is lost."""
         try:
-            self._transact(self._upkeep.run)
-        except ServerError as error:
-            if self._connection.closed:
-                raise
-            log.warning("%s; imud repeats the upkeep of the tables in %d s", error, UPKEEP_NS // NS_PER_S)
+            with self._connection.cursor() as cursor:
+                self._upkeep.run(cursor)
+        except self._error as error:
+            raise ServerError(f"PostgreSQL: {_sentence(error)}") from error
 
 
 def _decoded(

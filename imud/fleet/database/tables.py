@@ -275,8 +275,11 @@ REJECTED: Final = FleetTable(
 )
 SCHEMA: Final = FleetTable(
     "imud_schema",
-    "version of the tables and views",
-    (Column("version", "integer NOT NULL", "version; imud refuses tables of another version"),),
+    "version of the tables and views, one row",
+    (
+        Column("version", "integer NOT NULL", "version; imud refuses tables of another version"),
+        Column("upkeep_at", "timestamptz", "time of the database when a collector last removed old rows"),
+    ),
     ("version",),
 )
 TIMED: Final = (SAMPLES, INTERVALS, EVENTS, DROPPED)

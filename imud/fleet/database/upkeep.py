@@ -24,7 +24,6 @@ from imud.fleet.database.tables import (
     GATEWAYS,
     INTERVALS,
     LEDGER,
-    REJECTED,
     SAMPLES,
     SCHEMA,
     SCHEMA_VERSION,
@@ -40,12 +39,12 @@ log = logging.getLogger(__name__)
 _LOCK: Final = 0x696D7564_75706B70  # number of the advisory lock, "imudupkp"
 PREPARE_S: Final = 20  # maximum wait for another collector that creates the tables, s
 LOCK_MS: Final = 1000  # Maximum wait for a lock of a table, ms. Collectors wait for the same time.
-STATEMENT_S: Final = 60  # maximum time of a statement, s
+STATEMENT_S: Final = 10  # Maximum time of a statement, s. The collector stores no messages during this time.
 ROWS_STEP: Final = 10_000  # maximum number of rows that a step deletes
-STEPS_MAX: Final = 100  # Maximum number of steps of each kind in one run. The next run continues.
+STEPS_MAX: Final = 20  # Maximum number of steps of each kind in one run. The next run continues.
 BOOTS_STEP: Final = 100  # maximum number of boots that a step removes
-REJECTED_MAX: Final = 10_000  # number of rejected messages that stay
 SILENT_DAYS: Final = 7  # time without a message after which imud removes a boot with missing numbers, days
+INTERVAL_S: Final = 50  # minimum time between two runs of all collectors, s
 AHEAD: Final = 2  # number of partitions after the present partition
 # Age of the oldest partition of a new database, hours. The spool of a gateway keeps messages for this time by default.
 BEHIND_H: Final = 168
@@ -93,7 +92,14 @@ class Upkeep:
         for view in views(with_timescale=has_aggregates):
             if not _exists(cursor, view.name):
                 _execute(cursor, view.statements())
-        now = now or _now(cursor)
+        if self._is_owner(cursor):
+            self._divide(cursor, now or _now(cursor), has_aggregates=has_aggregates)
+        if with_timescale:
+            # the UTC time of a boot can change more compressed rows than the default limit, 100,000
+            cursor.execute("SET timescaledb.max_tuples_decompressed_per_dml_transaction = 0")
+
+    def _divide(self, cursor: Any, now: datetime, *, has_aggregates: bool) -> None:
+        """Create partitions, or configure hypertables and continuous aggregates."""
         for table in TIMED:
             if _is_hypertable(cursor, table):
                 self._guarded(cursor, f"set the chunks of {table.name}", partial(self._tune, table, cursor))
@@ -105,9 +111,6 @@ class Upkeep:
         if has_aggregates:
             policies = refresh_policies(self._settings.intervals_days)
             self._guarded(cursor, "set the refresh of hours and days", partial(_execute, cursor, policies))
-        if with_timescale:
-            # the UTC time of a boot can change more compressed rows than the default limit, 100,000
-            cursor.execute("SET timescaledb.max_tuples_decompressed_per_dml_transaction = 0")
 
     def _extend_all(self, table: FleetTable, cursor: Any, now: datetime) -> None:
         while self._extend(table, cursor, now):
@@ -136,13 +139,40 @@ class Upkeep:
     # --- every minute -------------------------------------------------------------------------------------------------
 
     def run(self, cursor: Any, now: datetime | None = None) -> None:
-        """Create partitions, and remove old partitions, boots and rejected messages. Call it outside a transaction.
-        `now` is the present time; None: the clock of the database. Do nothing while another collector does this work.
+        """Create partitions, and remove old partitions and boots. Call it outside a transaction. `now` is the present
+        time; None: the clock of the database. Do nothing if another collector did this work in the last INTERVAL_S.
         Raises psycopg.Error only if the connection is lost. Other problems are in the log, each once."""
+        if not self._guarded(cursor, "start the upkeep", partial(self._locked, cursor, self._claim, now)):
+            return
         for name, step in self._steps():
             for _ in range(STEPS_MAX):
                 if not self._guarded(cursor, name, partial(self._locked, cursor, step, now)):
                     break
+
+    def _claim(self, cursor: Any, now: datetime) -> bool:
+        """Return whether this collector does the present upkeep."""
+        if not self._is_owner(cursor):
+            return False
+        cursor.execute(
+            f"UPDATE {SCHEMA.name} SET upkeep_at = %(now)s WHERE upkeep_at IS NULL "
+            "OR upkeep_at NOT BETWEEN %(now)s - %(interval)s AND %(now)s",
+            {"now": now, "interval": timedelta(seconds=INTERVAL_S)},
+        )
+        return bool(cursor.rowcount)
+
+    def _is_owner(self, cursor: Any) -> bool:
+        """Return whether the user owns the tables. Log it once if not."""
+        cursor.execute(
+            "SELECT pg_has_role(relowner, 'USAGE'), current_user, relowner::regrole::text FROM pg_class "
+            "WHERE oid = %s::regclass", (SAMPLES.name,),
+        )  # fmt: skip
+        is_owner, user, owner = cursor.fetchone()
+        if not is_owner:
+            self._report(
+                f"the user {user} cannot create partitions or remove old rows, because {owner} owns the tables; run at "
+                f"least one collector as {owner}"
+            )
+        return bool(is_owner)
 
     def _steps(self) -> Iterator[tuple[str, Callable[[Any, datetime], bool]]]:
         """Yield the name and the function of each kind of work. The function returns whether more work is left."""
@@ -150,7 +180,6 @@ class Upkeep:
             yield f"create partitions of {table.name}", partial(self._extend, table)
             yield f"remove old rows of {table.name}", partial(self._retain, table)
         yield "remove old boots", self._expire
-        yield f"remove old rows of {REJECTED.name}", _limit_rejected
 
     def _locked(self, cursor: Any, step: Callable[[Any, datetime], bool], now: datetime | None) -> bool:
         """Run a step if no other collector runs one. Return whether more work is left."""
@@ -172,11 +201,8 @@ class Upkeep:
             if cursor.connection.closed:
                 raise
             reason = " ".join(str(error).split())
-            advice = ""
-            if isinstance(error, psycopg.errors.InsufficientPrivilege):
-                advice = "; run a collector as the owner of the table"
             if not isinstance(error, psycopg.errors.LockNotAvailable | psycopg.errors.DeadlockDetected):
-                self._report(f"cannot {name}: {reason}{advice}")
+                self._report(f"cannot {name}: {reason}")
             return False
 
     def _report(self, text: str) -> None:
@@ -493,12 +519,3 @@ def _delete_unset(cursor: Any, table: FleetTable, names: Iterable[tuple[str, str
     # TimescaleDB cannot select compressed rows by ctid
     cursor.execute(f"DELETE FROM {table.name} WHERE {condition} AND NOT utc_set", values)
     return False
-
-
-def _limit_rejected(cursor: Any, _now: datetime) -> bool:
-    """Delete some rejected messages before the newest REJECTED_MAX. Return whether more can be left."""
-    cursor.execute(
-        f"DELETE FROM {REJECTED.name} WHERE id IN "
-        f"(SELECT id FROM {REJECTED.name} ORDER BY id DESC OFFSET {REJECTED_MAX} LIMIT {ROWS_STEP})"
-    )
-    return bool(cursor.rowcount == ROWS_STEP)
