@@ -148,7 +148,7 @@ def _meaning(component: Component, measure: str) -> str:
 
 
 def _intervals(name: str, width: str, source: str, *, with_timescale: bool) -> FleetView:
-    """Return the view of the statistics of a `width` of time. `source`: table or view, and the conditions."""
+    """Return the view with statistics in steps of `width`. `source`: table or view, and the conditions."""
     # both functions align the times to UTC
     bucket = (
         f"time_bucket(interval '{width}', time)"

@@ -123,7 +123,7 @@ def test_hours_and_days_have_weighted_statistics(cursor: Any) -> None:
         )
         return list(cursor)
 
-    cursor.execute("SET TIME ZONE 'Asia/Kolkata'")  # 5:30 from UTC: hours and days must be those of UTC
+    cursor.execute("SET TIME ZONE 'Asia/Kolkata'")  # 5:30 from UTC: hours and days start by UTC
     key = ("mill", "gw-1", "bow")
     hours = [
         # mean (1·1 + 3·5) / 4, RMS √((1·1² + 3·5²) / 4) = √19
