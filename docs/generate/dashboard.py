@@ -1,20 +1,12 @@
-"""The dashboard for Grafana, from one description: `python -m docs.generate.dashboard` writes etc/grafana/imud.json.
+"""Dashboard for Grafana and Prometheus, from one description: `python -m docs.generate.dashboard` writes the file."""
 
-A row has a title and panels. A panel has a title, a unit of Grafana, and queries with their legends. The module
-computes the places and the other parts of Grafana's JSON. `QUERIES` contains every query as Grafana sends it, for the
-test.
-"""
-
-import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
+from docs.generate.grafana import Dashboard, Panel, Row, source, variable
 from tests.support.files import ROOT
 
-FILE: Final = ROOT / "etc/grafana/imud.json"
-COLUMNS: Final = 24
-"""Width of a dashboard in Grafana."""
 SOURCE: Final = {"type": "prometheus", "uid": "${source}"}
 DEVICE: Final = '{instance=~"$instance", device=~"$device"}'
 DAEMON: Final = '{instance=~"$instance"}'
@@ -29,27 +21,13 @@ class Query:
     expression: str
     legend: str = ""
 
-
-@dataclass(frozen=True, slots=True)
-class Panel:
-    """A panel. `kind`, `unit` and `options` use the names of Grafana."""
-
-    title: str
-    unit: str
-    queries: Sequence[Query]
-    kind: str = "timeseries"
-    width: int = 8
-    height: int = 7
-    help: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """A row. With `repeat`, Grafana draws one row for every selected device."""
-
-    title: str
-    panels: Sequence[Panel]
-    repeat: bool = False
+    def target(self, kind: str) -> dict[str, Any]:
+        """Return the query of a panel of this kind."""
+        is_table = kind == "table"
+        return {
+            "datasource": SOURCE, "expr": self.expression, "legendFormat": self.legend, "instant": is_table,
+            "range": not is_table, "format": {"table": "table", "heatmap": "heatmap"}.get(kind, "time_series"),
+        }  # fmt: skip
 
 
 def device(metric: str, legend: str, wrap: str = "{}", labels: str = "") -> Query:
@@ -118,7 +96,7 @@ OF_DEVICE: Final = Row("$device", [
         rate("imud_polls_missed_total", "missed"),
     ]),
     Panel("Ring of shared memory written", "none", [device("imud_ring_written", "written")]),
-], repeat=True)  # fmt: skip
+], repeat="device")  # fmt: skip
 
 CLIENTS: Final = Row("Clients and daemon", [
     Panel("Clients", "none", [Query(f"imud_clients{DAEMON}", "{{instance}} {{encoding}}")]),
@@ -138,12 +116,22 @@ CLIENTS: Final = Row("Clients and daemon", [
     Panel("Delay of the event loop", "s", [Query(f"imud_heartbeat_age_seconds{DAEMON}", "{{instance}}")]),
 ])  # fmt: skip
 
-ROWS: Final = (FLEET, OF_DEVICE, CLIENTS)
+DASHBOARD: Final = Dashboard(
+    title="imud", uid="imud", file=ROOT / "etc/grafana/imud.json", source=SOURCE, refresh="15s", begin="now-1h",
+    variables=(
+        source("Prometheus", "prometheus"),
+        variable("instance", SOURCE, {"query": 'label_values(up{job="imud"}, instance)', "refId": "instance"}, ".+"),
+        variable("device", SOURCE, {
+            "query": 'label_values(imud_device_up{instance=~"$instance"}, device)', "refId": "device",
+        }, ".+"),
+    ),
+    rows=(FLEET, OF_DEVICE, CLIENTS),
+)  # fmt: skip
 
 
 def queries() -> Iterator[tuple[str, str]]:
     """Yield the title of the panel and the expression of every query."""
-    for row in ROWS:
+    for row in DASHBOARD.rows:
         for panel in row.panels:
             for query in panel.queries:
                 yield panel.title, query.expression
@@ -154,76 +142,5 @@ def filled_in(expression: str, *, instance: str = ".+", device: str = ".+", wind
     return expression.replace("$instance", instance).replace("$device", device).replace("$__rate_interval", window)
 
 
-# --- the JSON of Grafana ----------------------------------------------------------------------------------------------
-
-
-def dashboard() -> dict[str, Any]:
-    """Return the whole dashboard."""
-    panels, y = [], 0
-    for row in ROWS:
-        made, height = _row(row, y)
-        panels += made
-        y += height
-    for number, panel in enumerate(panels, 1):
-        panel["id"] = number
-    return {
-        "title": "imud", "uid": "imud", "tags": ["imud"], "schemaVersion": 38, "editable": True, "refresh": "15s",
-        "time": {"from": "now-1h", "to": "now"}, "timezone": "browser",
-        "templating": {"list": [
-            {"name": "source", "label": "Prometheus", "type": "datasource", "query": "prometheus"},
-            _variable("instance", 'label_values(up{job="imud"}, instance)'),
-            _variable("device", 'label_values(imud_device_up{instance=~"$instance"}, device)'),
-        ]},
-        "panels": panels,
-    }  # fmt: skip
-
-
-def _variable(name: str, query: str) -> dict[str, Any]:
-    return {
-        "name": name, "type": "query", "datasource": SOURCE, "query": {"query": query, "refId": name},
-        "definition": query, "refresh": 2, "multi": True, "includeAll": True, "allValue": ".+", "sort": 1,
-        "current": {"text": "All", "value": "$__all"},
-    }  # fmt: skip
-
-
-def _row(row: Row, y: int) -> tuple[list[dict[str, Any]], int]:
-    """Return a row with its panels from left to right, line by line, and its height."""
-    head: dict[str, Any] = {
-        "type": "row", "title": row.title, "collapsed": False, "panels": [],
-        "gridPos": {"x": 0, "y": y, "w": COLUMNS, "h": 1},
-    }  # fmt: skip
-    if row.repeat:
-        head["repeat"] = "device"
-    made, x, top, high = [head], 0, y + 1, 0
-    for panel in row.panels:
-        if x + panel.width > COLUMNS:
-            x, top, high = 0, top + high, 0
-        made.append(_panel(panel, x, top))
-        x, high = x + panel.width, max(high, panel.height)
-    return made, top + high - y
-
-
-def _panel(panel: Panel, x: int, y: int) -> dict[str, Any]:
-    is_table = panel.kind == "table"
-    targets = [
-        {
-            "refId": chr(ord("A") + number), "datasource": SOURCE, "expr": query.expression,
-            "legendFormat": query.legend, "instant": is_table, "range": not is_table,
-            "format": {"table": "table", "heatmap": "heatmap"}.get(panel.kind, "time_series"),
-        }
-        for number, query in enumerate(panel.queries)
-    ]  # fmt: skip
-    return {
-        "type": panel.kind, "title": panel.title, "description": panel.help, "datasource": SOURCE,
-        "gridPos": {"x": x, "y": y, "w": panel.width, "h": panel.height},
-        "fieldConfig": {"defaults": {"unit": panel.unit}, "overrides": []}, "options": {}, "targets": targets,
-    }  # fmt: skip
-
-
-def text() -> str:
-    """Return the text of the file."""
-    return json.dumps(dashboard(), indent=1, ensure_ascii=False) + "\n"
-
-
 if __name__ == "__main__":
-    FILE.write_text(text())
+    DASHBOARD.write()

@@ -17,7 +17,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from docs.generate.dashboard import dashboard, filled_in
+from docs.generate.dashboard import DASHBOARD, filled_in
 from docs.generate.pictures import svg, text
 from imud.cli.demo import child, daemon
 from imud.client.connection import Client
@@ -108,7 +108,7 @@ def drawn(prometheus: RealPrometheus, span: Span) -> tuple[list[str], int]:
     """Return the parts of all panels, and the height."""
     parts: list[str] = []
     bottom = 0
-    for panel in dashboard()["panels"]:
+    for panel in DASHBOARD.document()["panels"]:
         place = panel["gridPos"]
         box = Box(place["x"] * CELL_X, place["y"] * CELL_Y, place["w"] * CELL_X, place["h"] * CELL_Y)
         bottom = max(bottom, round(box.y + box.height))

@@ -1,4 +1,4 @@
-"""The dashboard: file and picture match its description, and a real Prometheus has data for every query."""
+"""The dashboards: files and picture match their description, and a real Prometheus has data for every query."""
 
 import json
 import re
@@ -6,10 +6,11 @@ import subprocess
 import time
 from html import unescape
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
-from docs.generate import dashboard
+from docs.generate import dashboard, fleet_dashboard, grafana
 from docs.generate import dashboard_picture as picture
 from tests.monitoring.faults import Site, site
 from tests.monitoring.prometheus import LIMIT_S, Pace, RealPrometheus, needs, real_prometheus
@@ -17,20 +18,27 @@ from tests.support.files import ROOT
 from tests.support.surroundings import free_port
 
 
-def test_panels_stand_beside_each_other_and_are_in_the_picture() -> None:
-    assert dashboard.FILE.read_text() == dashboard.text(), "run python -m docs.generate.dashboard"
+@pytest.mark.parametrize("module", [dashboard, fleet_dashboard])
+def test_panels_stand_beside_each_other(module: ModuleType) -> None:
+    one = module.DASHBOARD
+    assert one.file.read_text() == one.text(), f"run python -m {module.__name__}"
     taken: set[tuple[int, int]] = set()
-    panels = json.loads(dashboard.text())["panels"]
+    panels = json.loads(one.text())["panels"]
     for panel in panels:
         place = panel["gridPos"]
         cells = {(x, y) for x in range(place["x"], place["x"] + place["w"])
                  for y in range(place["y"], place["y"] + place["h"])}  # fmt: skip
         assert not cells & taken, panel["title"]
-        assert max(x for x, _ in cells) < dashboard.COLUMNS
+        assert max(x for x, _ in cells) < grafana.COLUMNS
         taken |= cells
     assert len({panel["id"] for panel in panels}) == len(panels)
+    names = {variable["name"] for variable in one.variables}
+    assert set(re.findall(r"\$\{?([a-z]+)", one.text())) <= names
+
+
+def test_panels_are_in_the_picture() -> None:
     drawn = {unescape(words) for words in re.findall(r">([^<]+)</text>", picture.FILE.read_text())}
-    titles = {panel["title"].replace("$device", picture.CHOSEN) for panel in dashboard.dashboard()["panels"]}
+    titles = {panel["title"].replace("$device", picture.CHOSEN) for panel in dashboard.DASHBOARD.document()["panels"]}
     assert titles <= drawn, "run python -m docs.generate.dashboard_picture"
     assert f"]({picture.FILE.relative_to(ROOT / 'docs')})" in (ROOT / "docs/monitoring.md").read_text()
 

@@ -6,8 +6,10 @@ from typing import Any
 
 import pytest
 
-from imud.fleet.database.tables import GATEWAYS, INTERVALS, LEDGER, TABLES
-from imud.fleet.database.views import AGGREGATED, DAYS, HOURS, refresh_policies, statements, views
+from imud.fleet.database.settings import CollectorSettings
+from imud.fleet.database.tables import GATEWAYS, INTERVALS, LEDGER
+from imud.fleet.database.upkeep import Upkeep
+from imud.fleet.database.views import AGGREGATED, DAYS, HOURS, refresh_policies, views
 from imud.fleet.messages import NUMBER_MOST
 from imud.fleet.statistics import MEASURES
 from tests.fleet.database.fleet_rows import insert
@@ -24,23 +26,18 @@ def server(request: pytest.FixtureRequest) -> Iterator[Any]:
     """Yield a connection to a server with all tables and views."""
     import psycopg
 
-    has_timescale = request.param == "timescaledb"
     if KINDS[request.param]:
         pytest.skip(KINDS[request.param])
-    with running_server("timescaledb" if has_timescale else "") as made, psycopg.connect(made.url) as connection:
-        for statement in all_statements(with_timescale=has_timescale):
-            connection.execute(statement.encode())
-        connection.commit()
+    library = request.param.removeprefix("postgresql")
+    with running_server(library) as made, psycopg.connect(made.url) as connection:
+        prepare(connection)
         yield connection
 
 
-def all_statements(*, with_timescale: bool) -> Iterator[str]:
-    for table in TABLES:
-        yield from table.statements()
-    if with_timescale:
-        yield "CREATE EXTENSION timescaledb"
-        yield "SELECT create_hypertable('imud_intervals', 'time')"
-    yield from statements(with_timescale=with_timescale)
+def prepare(connection: Any) -> None:
+    """Create tables and views. With its library, TimescaleDB stores the intervals."""
+    with connection.transaction(), connection.cursor() as cursor:
+        Upkeep(CollectorSettings()).prepare(cursor)
 
 
 @pytest.fixture
@@ -175,8 +172,7 @@ def test_timescaledb_stores_hours_and_days(server: Any) -> None:
         connection.execute("CREATE DATABASE hours")
     with psycopg.connect(server.info.dsn, dbname="hours", autocommit=True) as connection:
         cursor = connection.cursor()
-        for statement in all_statements(with_timescale=True):
-            cursor.execute(statement.encode())
+        prepare(connection)
 
         def refresh(days: float | None) -> None:
             for statement in refresh_policies(days):
