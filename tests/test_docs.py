@@ -78,6 +78,8 @@ TESTED_ELSEWHERE = {
     "yaml my.rules.yml": "tests/monitoring/test_rules.py",
     "yaml sheet.yaml": "tests/cli/test_noise.py",
     "python captures.md": "tests/formats/test_capture.py",
+    "sql fleet-database.md": "tests/fleet/database/test_views_page.py",
+    "python fleet-database.md": "tests/fleet/database/test_views_page.py",
     "python fleet.md": "tests/fleet/test_reader.py",
     "python recording.md": "tests/cli/test_record.py",
     "python socket.md": "tests/publishers/socket/test_documentation.py",

@@ -6,6 +6,7 @@
 | docs/commands.md, docs/calibration.md, docs/settings.md | commands, calibrations and device settings of the drivers |
 | docs/shm.md | layout of shared memory |
 | docs/monitoring.md | rules for Prometheus |
+| docs/fleet-database.md | tables and views of the fleet database |
 | docs/stability.md | versions of the interfaces (tests/stability/interfaces.py) |
 | docs/python.md, docs/simulators.md | docstrings and signatures (docs/generate/python_reference.py) |
 | docs/socket.schema.json | messages of the socket (docs/generate/socket_schema.py) |
@@ -16,7 +17,7 @@ import inspect
 import os
 import re
 import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain, groupby
 from typing import Final, NamedTuple, get_args
 
@@ -36,7 +37,11 @@ from imud.contracts.lines import LINE_SCHEMAS, DeviceLines
 from imud.contracts.status import Deviations
 from imud.device.settings_plan import described_settings
 from imud.drivers import DRIVERS
+from imud.fleet.database.tables import COMPONENTS, Column
+from imud.fleet.database.tables import TABLES as DATABASE_TABLES
+from imud.fleet.database.views import views
 from imud.fleet.settings import DeviceSending
+from imud.fleet.statistics import MEASURES
 from imud.formats.ring import (
     HEADER_BYTES,
     HEADER_FIELDS,
@@ -391,6 +396,56 @@ def layout_tables() -> dict[str, str]:
     }
 
 
+# --- docs/fleet-database.md -------------------------------------------------------------------------------------------
+
+COMPONENT_OF: Final = {one.column(measure): one for one in COMPONENTS for measure in ("", *MEASURES)}
+
+
+def column_rows(columns: Sequence[Column]) -> Iterator[tuple[str, str]]:
+    """Yield names and other cells of the columns. One row contains all components and statistics of a field."""
+    for _, group in groupby(
+        columns, lambda one: COMPONENT_OF[one.name].field if one.name in COMPONENT_OF else one.name
+    ):
+        same = list(group)
+        components = dict.fromkeys(COMPONENT_OF[one.name] for one in same if one.name in COMPONENT_OF)
+        names = [one.name for one in same]
+        if len(names) > len(components) > 0:
+            names = [one.column("…") for one in components]
+        meaning = same[0].comment if not components else next(iter(components)).comment.partition("; component")[0]
+        yield ", ".join(f"`{name}`" for name in names), f"{same[0].type} | {cell(meaning)}"
+
+
+def database_part(
+    name: str, comment: str, columns: Sequence[Column], primary: Sequence[str], first_of: dict[tuple[str, str], str]
+) -> Iterator[str]:
+    """Yield title and table of a table or view. A row of an earlier table becomes a reference to that table."""
+    yield from (f"### `{name}`", "", f"{comment[:1].upper()}{comment[1:]}.", "")
+    if primary:
+        yield from (f"Primary key: {', '.join(f'`{one}`' for one in primary)}.", "")
+    rows, repeated = [], dict[str, list[str]]()
+    for names, cells in column_rows(columns):
+        first = first_of.setdefault((names, cells), name)
+        if first == name:
+            rows.append(f"| {names} | {cells} |")
+        else:
+            repeated.setdefault(first, []).append(names)
+    if rows:
+        yield from ("| column | type | meaning |", "|---|---|---|", *rows, "")
+    for first, found in repeated.items():
+        yield from (f"{', '.join(found)}: as in `{first}`.", "")
+
+
+def database_parts() -> dict[str, str]:
+    def text(parts: Iterable[tuple[str, str, Sequence[Column], Sequence[str]]]) -> str:
+        first_of = dict[tuple[str, str], str]()
+        return "\n" + "\n".join(chain.from_iterable(database_part(*part, first_of) for part in parts))
+
+    return {
+        "tables": text((one.name, one.comment, one.columns, one.primary) for one in DATABASE_TABLES),
+        "database views": text((one.name, one.comment, one.columns, ()) for one in views(with_timescale=False)),
+    }
+
+
 # --- docs/stability.md ------------------------------------------------------------------------------------------------
 
 
@@ -420,6 +475,7 @@ PAGES: Final[Mapping[str, Callable[[], Mapping[str, str]]]] = {
     "docs/settings.md": lambda: {"settings": "\n" + device_settings_tables()},
     "docs/shm.md": layout_tables,
     "docs/monitoring.md": lambda: {"alerts": alert_table()},
+    "docs/fleet-database.md": database_parts,
     "docs/stability.md": lambda: {"versions": versions()},
     "docs/python.md": lambda: {"reference": "\n" + python_reference(imud.client)},
     "docs/simulators.md": lambda: {"devices": simulators_table(), "reference": "\n" + python_reference(imud.sim)},
