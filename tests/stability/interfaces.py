@@ -38,7 +38,9 @@ from imud.contracts.status import FlightStatus
 from imud.drivers import DRIVERS
 from imud.fleet import messages
 from imud.fleet.accounts import GatewayState
-from imud.fleet.database.tables import TABLES as DATABASE_TABLES
+from imud.fleet.database.settings import CollectorSettings
+from imud.fleet.database.tables import SCHEMA_VERSION, TABLES, Column
+from imud.fleet.database.views import views as database_views
 from imud.formats import jsonrpc, recording, records, ring, slot
 from imud.formats.influx import event_fields, measure_fields, sample_fields
 from imud.model.errors import ConfigError, ImudError
@@ -378,8 +380,29 @@ def mqtt() -> Facts:
     return found | {f"slots of version {version}": f"{size} bytes" for version, size in messages._SLOT_BYTES.items()}
 
 
+UNIT: Final = re.compile(r", (ns since 1970|ns|ms|s|bytes|m/s²|rad/s|rad|m/s|m|T|°C|Pa)(?=[;-]|$)")
+"""Unit in the comment of a column."""
+
+
+def database() -> Facts:
+    found = {f"{one.name}, primary key": ", ".join(one.primary) for one in TABLES if one.primary}
+    parts = [(one.name, one.columns) for one in TABLES]
+    parts += [(one.name, one.columns) for one in database_views(with_timescale=False)]
+    return found | {f"{name}.{one.name}": _column_fact(one) for name, columns in parts for one in columns}
+
+
+def _column_fact(column: Column) -> str:
+    unit = UNIT.search(column.comment)
+    return f"{column.type}, {unit[1]}" if unit is not None else column.type
+
+
+def collector_configuration() -> Facts:
+    facts = type_facts(CollectorSettings, "", INPUT)
+    return {name.removeprefix("."): text for name, text in facts.items() if name}
+
+
 def other_outputs() -> Facts:
-    """Return the names in exported files, databases, and messages for other programs."""
+    """Return the names in exported files, InfluxDB, and messages for other programs."""
     found = {f"csv samples {name}": "column" for name in sample_columns(SAMPLE_FIELDS)}
     found |= {f"csv events {name}": "column" for name in EVENT_COLUMNS}
     found |= {f"csv losses {name}": "column" for name in LOSS_COLUMNS}
@@ -411,9 +434,6 @@ def other_outputs() -> Facts:
         (ROOT / f"imud/{name}.py").read_text() for name in ("fleet/influx", "publishers/influx/publisher")
     )
     found |= {f"influx {name}": "measurement" for name in re.findall(r'"(imud_[a-z]+)"', sources)}
-    for table in DATABASE_TABLES:
-        found |= {f"postgresql {table.name}.{one.name}": one.type for one in table.columns}
-        found[f"postgresql {table.name}, primary key"] = ", ".join(table.primary)
     for heading in (Heading.TRUE, Heading.MAGNETIC):
         reference = HeadingReference(heading, 3.0)
         paths = [*motion(FULL, reference), *surroundings(FULL, reference)]
@@ -427,6 +447,7 @@ _OF_IMUD: Final = "`imud --version`: the first two numbers"
 
 INTERFACES: Final[Mapping[str, Interface]] = {
     "configuration": Interface(_SERIES, _RELEASE, _OF_IMUD, configuration),
+    "collector-configuration": Interface(_SERIES, _RELEASE, _OF_IMUD, collector_configuration),
     "socket": Interface(
         str(jsonrpc.PROTOCOL), "PROTOCOL in imud/formats/jsonrpc.py", "`protocol` of the notification `hello`", socket
     ),
@@ -445,6 +466,10 @@ INTERFACES: Final[Mapping[str, Interface]] = {
     ),
     "mqtt": Interface(
         str(messages.VERSION), "VERSION in imud/fleet/messages.py", "`v` of each stream message, state and reply", mqtt
+    ),
+    "database": Interface(
+        str(SCHEMA_VERSION), "SCHEMA_VERSION in imud/fleet/database/tables.py", "`version` in the table `imud_schema`",
+        database,
     ),
     "other-outputs": Interface(_SERIES, _RELEASE, _OF_IMUD, other_outputs),
     "drivers": Interface(

@@ -1,10 +1,12 @@
 """Test that the interfaces of docs/stability.md are equal to their stored facts."""
 
+import re
+
 import pytest
 
 from imud.fleet.messages import CommandRequest
 from tests.stability.facts import INPUT, OUTPUT, module_facts, type_facts
-from tests.stability.interfaces import INTERFACES, series
+from tests.stability.interfaces import INTERFACES, database, series
 from tests.stability.snapshots import FOLDER, VERSION, advice, changes, present, problem, stored
 
 
@@ -57,3 +59,18 @@ def test_facts_of_a_type_differ_for_input_and_output() -> None:
     facts = type_facts(CommandRequest, "request", INPUT)
     assert (facts["request.v"], facts["request.arguments"]) == ("required, integer", "optional, object")
     assert type_facts(CommandRequest, "request", OUTPUT)["request.v"] == "always, integer"
+
+
+UNIT_OF = {
+    "m_s2": "m/s²", "rad_s": "rad/s", "m_s": "m/s", "rad": "rad", "t": "T", "c": "°C", "pa": "Pa", "m": "m", "ns": "ns",
+    "ms": "ms", "s": "s", "bytes": "bytes",
+}  # fmt: skip
+
+
+def test_the_name_of_a_column_of_the_database_ends_in_its_unit() -> None:
+    for name, text in database().items():
+        unit = text.partition(", ")[2] if "." in name else ""
+        end = re.search(rf"_({'|'.join(UNIT_OF)}|ns)$", name)
+        assert unit in (("",) if end is None else ("ns", "ns since 1970") if end[1] == "ns" else (UNIT_OF[end[1]],)), (
+            name
+        )
