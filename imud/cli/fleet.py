@@ -323,6 +323,11 @@ def _results(fleet: Fleet, store: FleetStore) -> Iterator[str]:
         yield store.ledger_text()
     elif ledger := account_table(fleet.accounts):
         yield ledger
+    if fleet.expired_boots or fleet.ledger.removed_streams:
+        yield (
+            f"not in the table: {fleet.expired_boots} old boots ({fleet.expired_incomplete} with missing numbers), "
+            f"{fleet.ledger.removed_streams} streams above the limit of the memory"
+        )
     if isinstance(store, LedgerStore) and isinstance(store.to, InfluxStore) and store.to.refused:
         yield f"the server rejected {store.to.refused} messages; the log has the reasons"
 

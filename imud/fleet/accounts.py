@@ -7,7 +7,7 @@ The numbers of a stream arrive in order. A gateway can send a message again, alo
 """
 
 from collections.abc import Mapping, Sequence
-from itertools import islice
+from itertools import chain, islice
 from typing import Final, NamedTuple, Self
 
 import msgspec
@@ -127,36 +127,73 @@ class StreamLedger:
         return found
 
 
+class BootKey(NamedTuple):
+    """Key of one start of a gateway's daemon."""
+
+    gateway: str
+    boot: str  # boot without the suffix `-N` of a device that restarted its counter
+
+
 class RecentStreams:
-    """Streams in the order of their use, with a maximum number. Synchronization: one thread.
+    """Streams in the order of the use of their boots, with a maximum number. Synchronization: one thread.
 
     A sender of many streams must not remove the streams of other gateways. If there are too many streams, the gateway
-    with the most streams loses its oldest ones. These are the streams of old boots.
+    with the most streams loses the streams of its oldest boots.
     """
 
     def __init__(self, most: int) -> None:
+        self.removed = 0  # number of streams that left because there were too many
         self._most = most
         self._count = 0
-        self._by_gateway: dict[str, dict[StreamKey, None]] = {}  # oldest first, both gateways and streams
+        # streams by gateway and boot, oldest boot first
+        self._by_gateway: dict[str, dict[BootKey, dict[StreamKey, None]]] = {}
+        self._sizes: dict[str, int] = {}  # number of streams of each gateway, oldest gateway first
 
-    def use(self, key: StreamKey) -> list[StreamKey]:
-        """Make a stream the newest. Return the streams that are removed because there are too many."""
-        own = self._by_gateway.pop(key.gateway, {})
-        self._count += key not in own
-        own.pop(key, None)
+    def use(self, key: StreamKey) -> Sequence[StreamKey]:
+        """Make the boot of a stream the newest. Return the streams that are removed because there are too many."""
+        boots = self._by_gateway.setdefault(key.gateway, {})
+        boot = _boot_of(key)
+        own = boots[boot] = boots.pop(boot, {})
+        is_new = key not in own
+        self._sizes[key.gateway] = self._sizes.pop(key.gateway, 0) + is_new
         own[key] = None
-        self._by_gateway[key.gateway] = own
-        if self._count <= self._most:
-            return []
-        largest = max(self._by_gateway.values(), key=len)
+        self._count += is_new
+        return () if self._count <= self._most else self._shrink()
+
+    def _shrink(self) -> Sequence[StreamKey]:
+        """Remove old streams of the gateway with the most streams."""
+        largest = max(self._sizes, key=self._sizes.__getitem__)
         # several at a time: the search for the largest takes 3 ms for 100,000 gateways
-        removed = list(islice(largest, 1 + len(largest) // 20))
+        removed = list(islice(chain.from_iterable(self._by_gateway[largest].values()), 1 + self._sizes[largest] // 20))
         for one in removed:
-            del largest[one]
-        self._count -= len(removed)
-        if not largest:
-            del self._by_gateway[removed[0].gateway]
+            self._remove(one)
+        self.removed += len(removed)
         return removed
+
+    def _remove(self, key: StreamKey) -> None:
+        boots, boot = self._by_gateway[key.gateway], _boot_of(key)
+        del boots[boot][key]
+        self._count -= 1
+        self._sizes[key.gateway] -= 1
+        if not boots[boot]:
+            del boots[boot]
+        if not boots:
+            del self._by_gateway[key.gateway], self._sizes[key.gateway]
+
+    def streams_of(self, boot: BootKey) -> Sequence[StreamKey]:
+        """Return the streams of a boot."""
+        return tuple(self._by_gateway.get(boot.gateway, {}).get(boot, ()))
+
+    def forget(self, boot: BootKey) -> Sequence[StreamKey]:
+        """Remove the streams of a boot. Return them."""
+        removed = self.streams_of(boot)
+        for one in removed:
+            self._remove(one)
+        return removed
+
+
+def _boot_of(key: StreamKey) -> BootKey:
+    return BootKey(key.gateway, key.boot.partition("-")[0])
 
 
 class FleetLedger:
@@ -173,6 +210,11 @@ class FleetLedger:
         """Return the counters of each stream."""
         return {key: account.counts for key, account in self._accounts.items()}
 
+    @property
+    def removed_streams(self) -> int:
+        """Return the number of streams that left the ledger because it had more than STREAMS_MAX streams."""
+        return self._recent.removed
+
     def take(self, message: FleetMessage, stream: Stream) -> FleetMessage | None:
         """Add a message. Return its new part, see `StreamLedger.take`."""
         key = key_of(message, stream)
@@ -182,6 +224,15 @@ class FleetLedger:
         if account is None:
             account = self._accounts[key] = StreamLedger.before(message, from_begin=self._from_begin)
         return account.take(message, stream)
+
+    def of_boot(self, boot: BootKey) -> Mapping[StreamKey, StreamCounts]:
+        """Return the counters of each stream of a boot."""
+        return {key: self._accounts[key].counts for key in self._recent.streams_of(boot)}
+
+    def forget(self, boot: BootKey) -> None:
+        """Remove the streams of a boot."""
+        for key in self._recent.forget(boot):
+            del self._accounts[key]
 
 
 # Maximum number of streams in the states of all gateways
@@ -254,6 +305,22 @@ class SpoolPositions:
             if known is None or one.last > known.last:
                 self._positions[key] = one
 
+    def is_complete(self, boot: BootKey, ledger: FleetLedger) -> bool:
+        """Return whether all numbers of a boot arrived: none is missing or in the spool."""
+        counts = ledger.of_boot(boot)
+        if any(one.missing for one in counts.values()):
+            return False
+        for key in self._recent.streams_of(boot):
+            position = self._positions[key]
+            if position.last > (counts[key].newest if key in counts else position.begin - 1):
+                return False
+        return True
+
+    def forget(self, boot: BootKey) -> None:
+        """Remove the positions of a boot."""
+        for key in self._recent.forget(boot):
+            del self._positions[key], self._begins[key]
+
     def accounts(self, ledger: FleetLedger) -> Mapping[StreamKey, StreamAccount]:
         """Return the ledger of each stream that appeared in a message or a state."""
         counts = dict(ledger.counts)
@@ -293,13 +360,6 @@ STEP_NS: Final = NS_PER_MS
 DRIFT: Final = 2000
 # Maximum number of boots with a stored offset, equal to STREAMS_MAX. imud removes the oldest.
 BOOTS_MAX: Final = 100_000
-
-
-class BootKey(NamedTuple):
-    """Key of one start of a gateway's daemon."""
-
-    gateway: str
-    boot: str  # boot without the suffix `-N` of a device that restarted its counter
 
 
 class BootOffset(NamedTuple):
@@ -377,6 +437,10 @@ class BootClocks:
         if state.clock is not None:
             self._note(BootKey(gateway, state.boot), clock_offset(state.clock))
 
+    def forget(self, boot: BootKey) -> None:
+        """Remove the offset of a boot."""
+        self._known.pop(boot, None)
+
     def take_fresh(self) -> Mapping[BootKey, BootOffset]:
         """Return the first offsets of boots since the last call."""
         fresh, self._fresh = self._fresh, {}
@@ -398,3 +462,29 @@ class BootClocks:
 def clock_offset(clock: GatewayClock) -> BootOffset | None:
     """Return the offset of a wall clock; None if the clock is not set."""
     return BootOffset(clock.t_ns, clock.utc_offset_ns, clock.error_ns) if clock.synchronised else None
+
+
+# Number of boots of a gateway with missing numbers that stay. A false sender can send any number of boots.
+INCOMPLETE_MAX: Final = 1000
+
+
+class GatewayBoots:
+    """Boots of all gateways in the order of their newest message. Synchronization: one thread."""
+
+    def __init__(self) -> None:
+        self._by_gateway: dict[str, dict[BootKey, int]] = {}  # time of the newest message or state, ns
+
+    def use(self, boot: BootKey, now_ns: int, keep: int) -> Mapping[BootKey, int]:
+        """Make a boot the newest. If it is new, return the boots before the newest `keep`, oldest first, with the time
+        of their newest message; otherwise an empty mapping."""
+        own = self._by_gateway.pop(boot.gateway, {})
+        is_new = own.pop(boot, None) is None
+        own[boot] = now_ns
+        self._by_gateway[boot.gateway] = own
+        while len(self._by_gateway) > BOOTS_MAX:
+            del self._by_gateway[next(iter(self._by_gateway))]
+        return dict(islice(own.items(), max(len(own) - keep, 0))) if is_new else {}
+
+    def forget(self, boot: BootKey) -> None:
+        """Remove a boot."""
+        self._by_gateway[boot.gateway].pop(boot, None)

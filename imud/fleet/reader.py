@@ -19,15 +19,18 @@ from types import TracebackType
 from typing import Any, Final, NamedTuple, Self
 
 from imud.fleet.accounts import (
+    INCOMPLETE_MAX,
     BootClocks,
     BootKey,
     BootOffset,
     FleetLedger,
+    GatewayBoots,
     GatewayState,
     PlacedTime,
     SpoolPositions,
     StreamAccount,
     StreamKey,
+    boot_of,
     decode_state,
     placed,
 )
@@ -327,6 +330,9 @@ log = logging.getLogger(__name__)
 # Time for which the broker keeps a named session without a connection, s. A broker can have a lower limit.
 SESSION_S: Final = 7 * 24 * 3600
 RETRY_MAX_S: Final = 60.0
+KEEP_BOOTS: Final = 10  # default number of boots of a gateway that stay in memory
+# Time without a message after which a boot with missing numbers leaves the memory, ns
+SILENT_NS: Final = 7 * 24 * 3600 * NS_PER_S
 VERSIONS: Final = ("5", "3.1.1")  # Supported versions of MQTT. The first is the default.
 
 
@@ -399,6 +405,11 @@ class Fleet:
         self.problem = ""  # cause of a missing connection, one sentence; empty while the reader is connected
         self.clocks = BootClocks()  # clock offsets of the gateways
         self._positions = SpoolPositions(from_begin=from_begin)
+        # Number of boots of each gateway that stay in memory. Earlier boots leave it when all their numbers arrived.
+        self.keep_boots = KEEP_BOOTS
+        self.expired_boots = 0  # number of boots that left the memory
+        self.expired_incomplete = 0  # number of these boots with missing numbers
+        self._boots = GatewayBoots()
 
     @property
     def ignored(self) -> int:
@@ -445,11 +456,26 @@ class Fleet:
             self._keep_state((parts.site, parts.gateway), content, len(delivery.payload))
             self._positions.take(parts.gateway, content)
             self.clocks.take_state(parts.gateway, content)
+            for boot in (*(one.boot for one in content.positions), content.boot):
+                self._expire(BootKey(parts.gateway, boot.partition("-")[0]))
             return None
         stream = Stream(parts.leaf)
         fresh = self.ledger.take(content, stream)
         offset = self.clocks.take(content)
+        self._expire(boot_of(content))
         return FleetBatch(parts.site, stream, fresh, offset) if fresh is not None else None
+
+    def _expire(self, newest: BootKey) -> None:
+        """Note a message of a boot. If the boot is new, remove the old boots of its gateway from the memory."""
+        now_ns = self.now_ns()
+        old = self._boots.use(newest, now_ns, self.keep_boots)
+        for number, (boot, at_ns) in enumerate(old.items(), 1):
+            is_complete = self._positions.is_complete(boot, self.ledger)
+            if is_complete or now_ns - at_ns > SILENT_NS or number <= len(old) - INCOMPLETE_MAX:
+                for owner in (self.ledger, self._positions, self.clocks, self._boots):
+                    owner.forget(boot)
+                self.expired_boots += 1
+                self.expired_incomplete += not is_complete
 
     def _keep_state(self, key: tuple[str, str], state: GatewayState, size: int) -> None:
         """Store the newest state of a gateway. Forget the oldest states if all states are too large."""

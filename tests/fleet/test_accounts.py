@@ -1,5 +1,6 @@
 """Ledger of a reader, across the network and restarts, for any order and repetition; UTC time of records."""
 
+from collections import Counter
 from typing import Any
 
 import msgspec
@@ -14,6 +15,7 @@ from imud.fleet.accounts import (
     FleetLedger,
     GatewayState,
     PlacedTime,
+    RecentStreams,
     SpoolPositions,
     StreamCounts,
     StreamKey,
@@ -24,10 +26,21 @@ from imud.fleet.accounts import (
     offset_of,
     placed,
 )
-from imud.fleet.messages import VERSION, DropCause, FleetMessage, GatewayClock, Interval, MessageKind, Stream
+from imud.fleet.messages import (
+    VERSION,
+    DropCause,
+    FleetMessage,
+    GatewayClock,
+    Interval,
+    MessageKind,
+    Stream,
+    encode_message,
+)
 from imud.fleet.reader import Fleet, FleetDelivery, ReaderConnection
 from imud.model.sample import Sample, Sync
+from imud.model.units import NS_PER_S
 from tests.fleet.fleet_gateway import UTC_NS, event_message, intervals_message, not_set, samples_message, synchronised
+from tests.support.event_loops import VirtualClock
 
 BOOTS_MAX, CLOCK_SET_NS, NUMBER_MOST = 100_000, 1_577_836_800_000_000_000, 1 << 62
 
@@ -284,6 +297,101 @@ def test_the_number_of_positions_is_limited(monkeypatch: pytest.MonkeyPatch) -> 
     for boot in ("1", "2", "1", "3"):
         positions.take("gw", state(5, boot))
     assert [key.boot for key in positions.accounts(FleetLedger())] == ["1", "3"]
+
+
+DAY_NS = 24 * 3600 * NS_PER_S
+BOOTS = [f"{number}" for number in range(1, 8)]
+# a message with the next number, a message after a gap, a fill of the gaps, or a state with a number that is not sent
+STEPS = st.lists(
+    st.tuples(st.sampled_from(BOOTS), st.sampled_from(["next", "gap", "fill", "state"]), st.integers(0, 5))
+)
+
+
+def delivery_of(fleet: Fleet, content: FleetMessage | GatewayState) -> FleetDelivery:
+    is_state = isinstance(content, GatewayState)
+    topic = "imud/mill/gw/state" if is_state else "imud/mill/gw/bow/samples"
+    payload = msgspec.json.encode(content) if is_state else encode_message(content)
+    return FleetDelivery(topic, payload, is_state, 0, ReaderConnection(fleet.brokers[0]))
+
+
+@given(STEPS, st.integers(1, 4))
+def test_complete_boots_leave_the_memory_and_other_boots_do_not(
+    steps: list[tuple[str, str, int]], keep: int
+) -> None:  # fmt: skip
+    """Compare the reader with sets of numbers of each boot. A step has a boot, a message, and a pause in days."""
+    clock = VirtualClock()
+    fleet = Fleet("mqtt://broker", from_begin=True, now_ns=clock.now_ns)
+    fleet.keep_boots = keep
+    seen: dict[str, set[int]] = {}  # numbers of each boot in memory, oldest boot first
+    ends: dict[str, int] = {}
+    at_ns: dict[str, int] = {}
+    removed = incomplete = 0
+    for boot, kind, days in steps:
+        clock.advance(days * DAY_NS)
+        is_new = boot not in seen
+        numbers = seen[boot] = seen.pop(boot, set())
+        newest = max(numbers, default=0)
+        at_ns[boot] = clock.now_ns()
+        if kind == "state":
+            ends[boot] = max(newest + 1, ends.get(boot, 0))
+            fleet.take(delivery_of(fleet, state(ends[boot], boot)))
+        else:
+            first, last = {"next": (newest + 1,) * 2, "gap": (newest + 3,) * 2, "fill": (1, newest + 1)}[kind]
+            batch = fleet.take(delivery_of(fleet, message(first, last, MessageKind.DROPPED, boot=boot)))
+            assert (batch is not None) == (not set(range(first, last + 1)) <= numbers)
+            numbers |= set(range(first, last + 1))
+        for old in list(seen)[:-keep] if is_new else ():
+            is_complete = len(seen[old]) == max(seen[old], default=0) >= ends.get(old, 0)
+            if is_complete or clock.now_ns() - at_ns[old] > 7 * DAY_NS:
+                removed, incomplete = removed + 1, incomplete + (not is_complete)
+                del seen[old]
+                ends.pop(old, None)
+        assert {key.boot for key in fleet.accounts} == set(seen)
+        assert all(one.balance == 0 for one in fleet.accounts.values())
+    assert (fleet.expired_boots, fleet.expired_incomplete) == (removed, incomplete)
+
+
+def test_the_memory_of_boots_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("imud.fleet.reader.INCOMPLETE_MAX", 5)
+    fleet = Fleet("mqtt://broker", from_begin=True)
+    for number in range(40):
+        fleet.take(delivery_of(fleet, synchronised(message(5, 5, boot=f"{number:x}"))))
+    assert [key.boot for key in fleet.accounts] == [f"{number:x}" for number in range(25, 40)]
+    assert {key.boot for key in fleet.offsets} == {key.boot for key in fleet.accounts}
+    assert (fleet.expired_boots, fleet.expired_incomplete) == (25, 25)
+    fleet.take(delivery_of(fleet, message(5, 5, boot="27-2")))
+    assert len(fleet.accounts) == 16, "a restarted device belongs to its boot"
+
+
+RECENT = st.lists(st.tuples(st.sampled_from("abc"), st.integers(1, 6), st.integers(1, 4)))
+
+
+@given(RECENT, st.integers(1, 20))
+def test_the_limit_removes_streams_of_the_oldest_boot_of_the_largest_gateway(
+    uses: list[tuple[str, int, int]], most: int
+) -> None:
+    recent, model, removed = RecentStreams(most), list[StreamKey](), 0
+    for gateway, boot, device in uses:
+        key = StreamKey(gateway, f"{boot}", f"{device}", "samples")
+        own = [one for one in model if one[:2] == key[:2]]
+        model = [one for one in model if one[:2] != key[:2]] + (own if key in own else [*own, key])
+        before = Counter(one.gateway for one in model)
+        gone = recent.use(key)
+        if gone:
+            assert len(model) == most + 1
+            assert before[gone[0].gateway] == max(before.values())
+            assert list(gone) == [one for one in model if one.gateway == gone[0].gateway][: len(gone)]
+            assert key not in gone
+        model = [one for one in model if one not in gone]
+        removed += len(gone)
+        boots = {BootKey(*one[:2]) for one in model}
+        assert [one for boot in sorted(boots) for one in recent.streams_of(boot)] == sorted(
+            model, key=lambda one: BootKey(*one[:2])
+        )
+    assert recent.removed == removed
+    for old in {BootKey(*one[:2]) for one in model}:
+        assert set(recent.forget(old)) == {one for one in model if one[:2] == old}
+        assert recent.streams_of(old) == ()
 
 
 def test_the_size_of_the_stored_states_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
