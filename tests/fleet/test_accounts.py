@@ -308,10 +308,11 @@ STEPS = st.lists(
 
 
 def delivery_of(fleet: Fleet, content: FleetMessage | GatewayState) -> FleetDelivery:
-    is_state = isinstance(content, GatewayState)
-    topic = "imud/mill/gw/state" if is_state else "imud/mill/gw/bow/samples"
-    payload = msgspec.json.encode(content) if is_state else encode_message(content)
-    return FleetDelivery(topic, payload, is_state, 0, ReaderConnection(fleet.brokers[0]))
+    if isinstance(content, GatewayState):
+        topic, payload = "imud/mill/gw/state", msgspec.json.encode(content)
+    else:
+        topic, payload = "imud/mill/gw/bow/samples", encode_message(content)
+    return FleetDelivery(topic, payload, False, 0, ReaderConnection(fleet.brokers[0]))
 
 
 @given(STEPS, st.integers(1, 4))
