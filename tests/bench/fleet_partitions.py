@@ -59,7 +59,7 @@ def measure(url: str, rows: int, days: int) -> list[tuple[str, str]]:
             made.prepare(cursor, NOW)
         is_native = cursor.execute("SELECT to_regclass('imud_intervals_set') IS NOT NULL").fetchone() == (True,)
         if is_native:
-            for day in range(8, days + 1):
+            for day in range(1, days + 1):
                 with connection.transaction():
                     low = NOW - timedelta(days=day)
                     _add_partition(cursor, INTERVALS, low, low + timedelta(days=1))

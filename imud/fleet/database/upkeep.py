@@ -16,6 +16,7 @@ import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import UTC, datetime, timedelta
 from functools import partial
+from itertools import chain
 from typing import Any, Final, NamedTuple
 
 from imud.fleet.database.settings import CollectorSettings
@@ -46,7 +47,7 @@ BOOTS_STEP: Final = 100  # maximum number of boots that a step removes
 SILENT_DAYS: Final = 7  # time without a message after which imud removes a boot with missing numbers, days
 INTERVAL_S: Final = 50  # minimum time between two runs of all collectors, s
 AHEAD: Final = 2  # number of partitions after the present partition
-# Age of the oldest partition of a new database, hours. The spool of a gateway keeps messages for this time by default.
+# Age of the oldest partition in a new database, hours. The spool of a gateway keeps messages for this time by default.
 BEHIND_H: Final = 168
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 # First version of TimescaleDB that can delete compressed rows
@@ -113,7 +114,8 @@ class Upkeep:
             self._guarded(cursor, "set the refresh of hours and days", partial(_execute, cursor, policies))
 
     def _extend_all(self, table: FleetTable, cursor: Any, now: datetime) -> None:
-        while self._extend(table, cursor, now):
+        # one transaction creates few partitions, because it holds several locks for each of them
+        while self._extend(table, cursor, now, timedelta()):
             pass
 
     def _tune(self, table: FleetTable, cursor: Any) -> None:
@@ -221,15 +223,17 @@ class Upkeep:
         )
         return None if days is None else now - timedelta(days=days)
 
-    def _extend(self, table: FleetTable, cursor: Any, now: datetime) -> bool:
-        """Create one missing partition. Return whether there was one."""
+    def _extend(
+        self, table: FleetTable, cursor: Any, now: datetime, behind: timedelta = timedelta(hours=BEHIND_H)
+    ) -> bool:  # fmt: skip
+        """Create one missing partition. `behind`: age of the oldest one. Return whether one was missing."""
         if not _is_partitioned(cursor, table):
             return False
         width, cut = timedelta(hours=self._settings.partition_hours), self._cut(table, now)
         present = _EPOCH + (now - _EPOCH) // width * width
-        begin = present - timedelta(hours=BEHIND_H) // width * width
         known = _partitions(cursor, table)
-        for low, high in _free(begin, present + (AHEAD + 1) * width, width, known):
+        ahead = _free(present, present + (AHEAD + 1) * width, width, known)
+        for low, high in chain(ahead, _free(present - behind // width * width, present, width, known)):
             if cut is None or high > cut:
                 _add_partition(cursor, table, low, high)
                 return True
@@ -254,9 +258,10 @@ class Upkeep:
     def _retain_chunk(self, cursor: Any, table: FleetTable, cut: datetime) -> bool:
         """Drop one old chunk. If it contains rows without a known time, delete a part of its other rows."""
         for one in _chunks(cursor, table, cut):
-            cursor.execute(f"LOCK TABLE {one.name} IN ACCESS EXCLUSIVE MODE")
-            cursor.execute(f"SELECT EXISTS (SELECT FROM {one.name} WHERE NOT utc_set)")
-            if not cursor.fetchone()[0]:
+            if not _has_unset(cursor, one):
+                cursor.execute(f"LOCK TABLE {one.name} IN ACCESS EXCLUSIVE MODE")
+                if _has_unset(cursor, one):
+                    return True
                 cursor.execute(
                     "SELECT drop_chunks(%s::regclass, older_than => %s::timestamptz, newer_than => %s::timestamptz)",
                     (table.name, one.end, one.begin),
@@ -442,6 +447,12 @@ def _chunks(cursor: Any, table: FleetTable, cut: datetime) -> Sequence[_Partitio
         "ORDER BY range_start", (table.name, cut),
     )  # fmt: skip
     return [_Partition(*row) for row in cursor]
+
+
+def _has_unset(cursor: Any, chunk: _Partition) -> bool:
+    """Return whether a chunk contains rows without a known time."""
+    cursor.execute(f"SELECT EXISTS (SELECT FROM {chunk.name} WHERE NOT utc_set)")
+    return bool(cursor.fetchone()[0])
 
 
 # --- partitions -------------------------------------------------------------------------------------------------------
