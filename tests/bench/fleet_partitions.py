@@ -38,6 +38,8 @@ ROWS: Final = (
 QUERIES: Final = {
     "last hour of a gateway": "SELECT time, accel_x_mean_m_s2 FROM imud_intervals WHERE gateway = 'gw-7' "
     "AND device = 'bow' AND time > %(now)s - interval '1 hour'",
+    "last hour of a gateway, times as constants": "SELECT time, accel_x_mean_m_s2 FROM imud_intervals WHERE "
+    "gateway = 'gw-7' AND device = 'bow' AND time > '2026-06-14 23:00+00' AND time < '2026-06-15 00:00+00'",
     "last day of a gateway": "SELECT time, accel_x_mean_m_s2 FROM imud_intervals WHERE gateway = 'gw-7' "
     "AND device = 'bow' AND time > %(now)s - interval '1 day'",
     "last hour of all gateways": "SELECT gateway, avg(accel_x_mean_m_s2) FROM imud_intervals WHERE "

@@ -38,11 +38,12 @@ NO_TIMESCALE: Final = NO_POSTGRES or ("" if _has_timescale() else "TimescaleDB i
 class PostgresServer:
     """Server process with its own data folder. Synchronization: one thread."""
 
-    def __init__(self, folder: Path, libraries: str = "") -> None:
-        """Create the data folder. `libraries` is the value of `shared_preload_libraries`."""
+    def __init__(self, folder: Path, libraries: str = "", options: str = "") -> None:
+        """Create the data folder. `libraries` is the value of `shared_preload_libraries`. `options` are further options
+        of the command `postgres`."""
         self.url = f"postgresql:///postgres?host={folder}&user=imud"
         self._folder = folder
-        self._libraries = libraries
+        self._libraries, self._options = libraries, options
         self._runs = False
         root = os.geteuid() == 0
         self._before = ["setpriv", "--reuid=postgres", "--regid=postgres", "--clear-groups"] if root else []
@@ -53,7 +54,8 @@ class PostgresServer:
     def start(self) -> None:
         """Start the server and wait for a reply. After `kill`, it recovers from its log."""
         options = (
-            f"-k {self._folder} -c listen_addresses='' -c fsync=off -c shared_preload_libraries='{self._libraries}'"
+            f"-k {self._folder} -c listen_addresses='' -c fsync=off -c shared_preload_libraries='{self._libraries}' "
+            + self._options
         )
         self._call("pg_ctl", "-l", str(self._folder / "log"), "-w", "-t", str(LIMIT_S), "-o", options, "start")
         self._runs = True
@@ -74,10 +76,10 @@ class PostgresServer:
 
 
 @contextmanager
-def running_server(libraries: str = "") -> Iterator[PostgresServer]:
+def running_server(libraries: str = "", options: str = "") -> Iterator[PostgresServer]:
     folder = Path(tempfile.mkdtemp(prefix="imud-pg-", dir="/tmp"))  # other users cannot read tmp_path
     try:
-        server = PostgresServer(folder, libraries)
+        server = PostgresServer(folder, libraries, options)
         server.start()
         try:
             yield server

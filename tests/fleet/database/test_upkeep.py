@@ -446,6 +446,20 @@ def test_compression_and_chunks_follow_the_configuration(database: Database, lib
     assert database.query(after) == []
 
 
+@live
+@needs_timescale
+def test_the_apache_license_has_hypertables_without_compression() -> None:
+    with running_server("timescaledb", "-c timescaledb.license=apache") as server:
+        database = Database(server.url)
+        with closing(database.connection):
+            made = database.prepare(samples_days=3)
+            database.add(SAMPLES, time=NOW - 6 * DAY)
+            assert database.run(made).dropped_partitions == 1
+            found = "SELECT DISTINCT compression_enabled FROM timescaledb_information.hypertables"
+            assert database.query(found) == [(False,)]
+            assert database.query("SELECT count(*) FROM imud_intervals_1h") == [(0,)]
+
+
 # --- ranges -----------------------------------------------------------------------------------------------------------
 
 RANGE = st.tuples(st.integers(0, 90), st.integers(1, 20))
