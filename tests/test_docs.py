@@ -76,6 +76,7 @@ TESTED_ELSEWHERE = {
     "yaml prometheus.yml": "tests/monitoring/test_rules.py",
     "yaml imud-targets.yml": "tests/monitoring/test_rules.py",
     "yaml my.rules.yml": "tests/monitoring/test_rules.py",
+    "yaml collector.yaml": "tests/fleet/database/test_upkeep.py",
     "yaml sheet.yaml": "tests/cli/test_noise.py",
     "python captures.md": "tests/formats/test_capture.py",
     "sql fleet-database.md": "tests/fleet/database/test_views_page.py",

@@ -1,18 +1,22 @@
-"""Upkeep of a real database with partitions or hypertables: retention, expiry, and collectors that write meanwhile."""
+"""Upkeep of a real database with partitions or hypertables: retention, expiry, and collectors that write during it."""
 
 import logging
+import re
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from datetime import UTC, datetime, timedelta
 from itertools import count
+from pathlib import Path
 from typing import Any, Final
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import asdict
 
+from imud.config import load_options
 from imud.fleet.database import upkeep
 from imud.fleet.database.settings import CollectorSettings
 from imud.fleet.database.tables import BOOTS, EVENTS, GATEWAYS, INTERVALS, LEDGER, SAMPLES, TIMED, FleetTable
@@ -21,6 +25,7 @@ from imud.model.errors import ServerError
 from tests.fleet.database.fleet_rows import insert
 from tests.fleet.postgres_server import NO_POSTGRES, NO_TIMESCALE, running_server
 from tests.support.daemon_process import LIMIT_S
+from tests.support.files import ROOT
 
 live = pytest.mark.live
 needs_postgres = pytest.mark.skipif(bool(NO_POSTGRES), reason=NO_POSTGRES)
@@ -458,6 +463,25 @@ def test_the_apache_license_has_hypertables_without_compression() -> None:
             found = "SELECT DISTINCT compression_enabled FROM timescaledb_information.hypertables"
             assert database.query(found) == [(False,)]
             assert database.query("SELECT count(*) FROM imud_intervals_1h") == [(0,)]
+
+
+# --- documentation ----------------------------------------------------------------------------------------------------
+
+
+def test_the_page_has_a_valid_configuration_and_all_settings_of_the_upkeep(tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "fleet-database.md").read_text()
+    ((example,),) = [re.findall(r"```yaml\n(# collector.yaml.*?)```", page, re.DOTALL)]
+    (tmp_path / "collector.yaml").write_text(example)
+    made = load_options(str(tmp_path / "collector.yaml"), CollectorSettings)
+    assert (made.samples_days, made.intervals_days, made.events_days) == (30, 730, 730)
+    section = page.partition("## Partitions and retention")[2].partition("\n## ")[0]
+    rows = dict(re.findall(r"^\| `(\w+)` \| ([\w.]+) \|", section, re.MULTILINE))
+    shown = {name: "never" if value is None else f"{value:g}" for name, value in asdict(CollectorSettings()).items()
+             if name in rows}  # fmt: skip
+    assert rows == shown
+    assert {name for name in rows if name.endswith("days")} == {
+        name for name in CollectorSettings.__struct_fields__ if name.endswith("days")
+    }
 
 
 # --- ranges -----------------------------------------------------------------------------------------------------------
