@@ -134,14 +134,16 @@ def main(words: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rows", type=int, default=1_000_000)
     parser.add_argument("--days", type=int, nargs="+", default=[10, 1000])
+    parser.add_argument("--engines", nargs="+", default=["partitions", "timescaledb"])
     args = parser.parse_args(words)
-    for library in ("", "timescaledb"):
+    for engine in args.engines:
+        library = engine.removeprefix("partitions")
         if library and NO_TIMESCALE:
             print(NO_TIMESCALE)
             continue
         for days in args.days:
             with running_server(library) as server:
-                print(f"\n{library or 'partitions'}, {args.rows:,} rows, {days} days", flush=True)
+                print(f"\n{engine}, {args.rows:,} rows, {days} days", flush=True)
                 for name, value in measure(server.url, args.rows, days):
                     print(f"| {name} | {value} |", flush=True)
 
