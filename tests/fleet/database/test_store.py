@@ -108,6 +108,9 @@ def test_rows_get_their_utc_time_when_the_clock_is_set(database: str, wrong_ns: 
     assert [row[0] for row in placed(database) if not row[3]] == [9]
     found = query(database, "SELECT utc_ns, end_utc_ns FROM imud_intervals")
     assert found == [(UTC_NS + 4_000_000, UTC_NS + 5_000_000)]
+    rows = placed(database)
+    write(database, *(not_set(one, wrong_ns) for one in before), *map(synchronised, before))
+    assert placed(database) == rows, "a repeated message is a duplicate, although the time of its rows changed"
 
 
 def test_a_stored_clock_offset_is_used_after_a_restart(database: str) -> None:
