@@ -2,8 +2,9 @@
 
     whole + thinned + dropped + missing = newest - begin + 1        (duplicates are a separate counter)
 
-The numbers of a stream arrive in order. A gateway can send a message again, alone or as part of a message with the kind
-`dropped`, if it did not receive the acknowledgement. Numbers that the ledger already contains count as duplicates.
+A gateway sends the numbers of a stream in order, but several collectors receive them in any order. A gateway can send a
+message again, alone or as part of a message with the kind `dropped`, if it did not receive the acknowledgement. Numbers
+that the ledger already contains count as duplicates.
 """
 
 from collections.abc import Mapping, Sequence
@@ -90,6 +91,11 @@ class StreamLedger:
     def _fresh(self, message: FleetMessage, stream: Stream) -> list[tuple[int, int]]:
         """Add a message. Return the ranges of new numbers."""
         counts = self.counts
+        if message.first < counts.begin:
+            # several collectors receive the first messages of a stream in any order
+            self.gaps.insert(0, (message.first, counts.begin - 1))
+            counts.missing += counts.begin - message.first
+            counts.begin = message.first
         fresh = self._filled(message.first, min(message.last, counts.newest))
         if message.last > counts.newest:
             # a gap before the message
@@ -97,9 +103,9 @@ class StreamLedger:
             if first > counts.newest + 1:
                 self.gaps.append((counts.newest + 1, first - 1))
                 counts.missing += first - 1 - counts.newest
-                del self.gaps[:-RANGES_MAX]
             fresh.append((first, message.last))
             counts.newest = message.last
+        del self.gaps[:-RANGES_MAX]
         number = sum([last - first + 1 for first, last in fresh])
         # the part that is not new
         counts.duplicates = min(counts.duplicates + message.last - message.first + 1 - number, NUMBER_MOST)

@@ -75,6 +75,8 @@ def test_each_number_counts_once_and_is_delivered_once() -> None:
     assert counts == StreamCounts(1, 10, whole=7, missing=3), "missing samples can arrive later"
     assert counts_of(message(7, 8), from_begin=False) == StreamCounts(7, 8, whole=2)
     assert counts_of(message(7, 8)) == StreamCounts(1, 8, whole=2, missing=6)
+    counts = counts_of(message(9, 10), message(3, 4), message(5, 9), message(3, 4), message(1, 1), from_begin=False)
+    assert counts == StreamCounts(1, 10, whole=9, missing=1, duplicates=3), "the first messages arrive in any order"
     ledger = FleetLedger()
     assert ledger.take(message(1, 10), Stream.SAMPLES) is not None
     assert ledger.take(message(1, 10), Stream.SAMPLES) is None
