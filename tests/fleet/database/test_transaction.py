@@ -51,14 +51,15 @@ def made(kind: MessageKind, first: int, last: int, boot: str, *, has_clock: bool
     return synchronised(message) if has_clock else not_set(message, WRONG_NS)
 
 
-@given(turns=TURNS)
-def test_rows_are_exactly_once_for_any_order_and_any_collector(server: str, turns: Any) -> None:
+@given(turns=TURNS, from_begin=st.booleans())
+def test_rows_are_exactly_once_for_any_order_and_any_collector(server: str, turns: Any, *, from_begin: bool) -> None:
     """Two collectors receive messages of two streams of one boot. A clock is known in some of the messages."""
     gateway = f"gw-{next(NUMBER)}"
     seen: dict[str, dict[int, MessageKind]] = {"1": {}, "1-2": {}}
     ranges: set[tuple[str, int, int, MessageKind]] = set()
     arrived, is_known = dict.fromkeys(seen, 0), False
-    with closing(PostgresStore(server, from_begin=True)) as one, closing(PostgresStore(server, from_begin=True)) as two:
+    one, two = stores = [PostgresStore(server, from_begin=from_begin) for _ in range(2)]
+    with closing(one), closing(two):
         for number, content in turns:
             messages = []
             for kind, first, length, boot, has_clock in content:
@@ -70,15 +71,16 @@ def test_rows_are_exactly_once_for_any_order_and_any_collector(server: str, turn
                 if new := set(range(first, last + 1)) - seen[boot].keys():
                     ranges.add((boot, first, last, kind))
                 seen[boot] |= dict.fromkeys(new, kind)
-            (one, two)[number].write(messages)
+            stores[number].write(messages)
 
     def rows(columns: str, table: str) -> list[Any]:
         return query(server, f"SELECT {columns} FROM {table} WHERE gateway = '{gateway}' ORDER BY 1, 2, 3")
 
-    assert rows(f"boot, newest, whole, thinned, dropped, missing, duplicates, begin, {BALANCE}", "imud_ledger") == [
+    assert rows(f"boot, begin, newest, whole, thinned, dropped, missing, duplicates, {BALANCE}", "imud_ledger") == [
         (
-            boot, max(numbers), *(sum(one is kind for one in numbers.values()) for kind in KINDS),
-            max(numbers) - len(numbers), arrived[boot] - len(numbers), 1, 0,
+            boot, begin := 1 if from_begin else min(numbers), max(numbers),
+            *(sum(one is kind for one in numbers.values()) for kind in KINDS),
+            max(numbers) - begin + 1 - len(numbers), arrived[boot] - len(numbers), 0,
         )
         for boot, numbers in seen.items() if numbers
     ]  # fmt: skip
