@@ -144,6 +144,8 @@ class Upkeep:
         """Create partitions, and remove old partitions and boots. Call it outside a transaction. `now` is the present
         time; None: the clock of the database. Do nothing if another collector did this work in the last INTERVAL_S.
         Raises psycopg.Error only if the connection is lost. Other problems are in the log, each once."""
+        # each step ends its transaction, so that collectors wait for one step only
+        assert not cursor.connection.info.transaction_status, "expected a connection outside a transaction"
         if not self._guarded(cursor, "start the upkeep", partial(self._locked, cursor, self._claim, now)):
             return
         for name, step in self._steps():

@@ -19,9 +19,11 @@ from msgspec.structs import asdict
 from imud.config import load_options
 from imud.fleet.database import upkeep
 from imud.fleet.database.settings import CollectorSettings
+from imud.fleet.database.store import PostgresStore
 from imud.fleet.database.tables import BOOTS, EVENTS, GATEWAYS, INTERVALS, LEDGER, SAMPLES, TIMED, FleetTable
 from imud.fleet.database.upkeep import Upkeep
 from imud.model.errors import ServerError
+from imud.model.units import NS_PER_S
 from tests.fleet.database.fleet_rows import insert
 from tests.fleet.postgres_server import NO_POSTGRES, NO_TIMESCALE, running_server
 from tests.support.daemon_process import LIMIT_S
@@ -280,6 +282,21 @@ def test_bounded_steps_remove_everything(database: Database, monkeypatch: pytest
     database.run(made)
     assert database.query("SELECT boot FROM imud_boots") == [("7",)]
     assert database.query("SELECT boot, count(*) FROM imud_samples GROUP BY 1") == [("7", 4)]
+
+
+@live
+@both
+def test_the_store_does_the_upkeep_each_minute(database: Database, library: str) -> None:
+    old, minutes = datetime(2001, 1, 1, tzinfo=UTC), iter(range(1, 100))
+    store = PostgresStore(database.url, CollectorSettings(samples_days=1), now_ns=lambda: next(minutes) * 60 * NS_PER_S)
+    with closing(store):
+        for seq in range(3):
+            database.add(SAMPLES, time=old, seq=seq)
+            database.query("UPDATE imud_schema SET upkeep_at = NULL")
+            store.write([])
+            assert database.times() == []
+            locks = "SELECT count(*) FROM pg_locks JOIN pg_stat_activity USING (pid) WHERE application_name ~ '^imud'"
+            assert database.query(locks) == [(0,)], "the upkeep ends its transactions"
 
 
 # --- several collectors -----------------------------------------------------------------------------------------------
