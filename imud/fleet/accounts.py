@@ -27,7 +27,9 @@ from imud.fleet.messages import (
 )
 from imud.model.units import NS_PER_MS
 
-RANGES_MAX: Final = 1000  # Maximum number of stored gaps per stream. Numbers of older gaps stay missing.
+# Maximum number of stored gaps per stream. The ledger cannot distinguish late numbers of older gaps from duplicates. It
+# accepts all of them: a store with a primary key does not store a row twice.
+RANGES_MAX: Final = 1000
 # Maximum number of streams of all gateways and boots: 1,000 gateways with 3 streams and 33 boots
 STREAMS_MAX: Final = 100_000
 
@@ -91,12 +93,20 @@ class StreamLedger:
     def _fresh(self, message: FleetMessage, stream: Stream) -> list[tuple[int, int]]:
         """Add a message. Return the ranges of new numbers."""
         counts = self.counts
+        # missing numbers without a stored gap; their gaps are older than all stored gaps
+        unknown = counts.missing - _numbers_of(self.gaps) if counts.missing else 0
         if message.first < counts.begin:
             # several collectors receive the first messages of a stream in any order
-            self.gaps.insert(0, (message.first, counts.begin - 1))
-            counts.missing += counts.begin - message.first
+            earlier = counts.begin - message.first
+            if unknown:
+                unknown += earlier
+            else:
+                self.gaps.insert(0, (message.first, counts.begin - 1))
+            counts.missing += earlier
             counts.begin = message.first
-        fresh = self._filled(message.first, min(message.last, counts.newest))
+        last = min(message.last, counts.newest)
+        late = (message.first, min(last, self.gaps[0][0] - 1 if self.gaps else last))
+        fresh = self._filled(message.first, last)
         if message.last > counts.newest:
             # a gap before the message
             first = max(message.first, counts.newest + 1)
@@ -106,7 +116,12 @@ class StreamLedger:
             fresh.append((first, message.last))
             counts.newest = message.last
         del self.gaps[:-RANGES_MAX]
-        number = sum([last - first + 1 for first, last in fresh])
+        number = _numbers_of(fresh)
+        if unknown and late[0] <= late[1]:
+            found = min(_numbers_of([late]), unknown)
+            counts.missing -= found
+            number += found
+            fresh.insert(0, late)
         # the part that is not new
         counts.duplicates = min(counts.duplicates + message.last - message.first + 1 - number, NUMBER_MOST)
         if message.kind is MessageKind.DROPPED:
@@ -131,6 +146,10 @@ class StreamLedger:
             left += [one for one in ((begin, low - 1), (high + 1, end)) if one[0] <= one[1]]
         self.gaps = left
         return found
+
+
+def _numbers_of(ranges: Sequence[tuple[int, int]]) -> int:
+    return sum([last - first + 1 for first, last in ranges])
 
 
 class BootKey(NamedTuple):

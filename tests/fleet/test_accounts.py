@@ -2,6 +2,7 @@
 
 from collections import Counter
 from typing import Any
+from unittest.mock import patch
 
 import msgspec
 import pytest
@@ -291,6 +292,23 @@ def test_the_ledger_balances_for_any_sequence(steps: list[tuple[Any, ...]]) -> N
             assert (told.balance, told.sent) == (0, max(numbers | {newest.get(key.boot, 0)}))
             assert told.counts.missing == max(numbers, default=0) - len(numbers)
             assert told.in_spool == max(0, newest.get(key.boot, 0) - max(numbers, default=0))
+
+
+@given(st.permutations([(first, first + 2) for first in range(1, 43, 3)]), st.booleans())
+def test_late_numbers_of_gaps_that_are_not_stored_are_new(spans: list[tuple[int, int]], from_begin: bool) -> None:
+    """Shares of a fleet can differ by more messages than a ledger stores gaps."""
+    with patch("imud.fleet.accounts.RANGES_MAX", 2):
+        ledger, delivered = FleetLedger(from_begin=from_begin), Counter[int]()
+        for span in spans:
+            fresh = ledger.take(message(*span), Stream.SAMPLES)
+            delivered.update(one.seq for one in (fresh.samples if fresh is not None else []))
+            (counts,) = ledger.counts.values()
+            assert counts.balance == 0
+        assert delivered == Counter(range(1, 43))
+        assert counts == StreamCounts(1, 42, whole=42)
+        assert ledger.take(message(1, 42), Stream.SAMPLES) is None, (
+            "without missing numbers, all numbers are duplicates"
+        )
 
 
 def test_the_number_of_positions_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
