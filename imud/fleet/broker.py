@@ -186,10 +186,14 @@ def open_client(
     client.connect(broker.host, broker.port, keep_alive_s, clean_start=not session_s, properties=bounds)
 
 
-def close_client(client: Any) -> None:
-    """Send DISCONNECT and close the socket. Do nothing if the connection is already lost."""
+def close_client(client: Any, *, ends_session: bool = False) -> None:
+    """Send DISCONNECT and close the socket. Do nothing if the connection is already lost. With `ends_session`, the
+    broker removes the session of MQTT 5."""
     with suppress(OSError, ValueError):
-        client.disconnect()
+        if ends_session:
+            client.disconnect(properties=properties_of("DISCONNECT", SessionExpiryInterval=0))
+        else:
+            client.disconnect()
     # paho-mqtt keeps the socket open if DISCONNECT waits behind unsent data
     if (sock := client.socket()) is not None:
         with suppress(OSError):

@@ -15,8 +15,9 @@ from typing import Final, NamedTuple, Protocol, TextIO
 import msgspec
 
 from imud.fleet.accounts import BootKey, BootOffset, PlacedTime
+from imud.fleet.connection import RECEIVE_MAX, FleetDelivery
 from imud.fleet.messages import Interval, MessageKind
-from imud.fleet.reader import RECEIVE_MAX, Fleet, FleetBatch, FleetDelivery, FleetSession
+from imud.fleet.reader import Fleet, FleetBatch, FleetSession
 from imud.model.units import NS_PER_S
 
 COMMIT_S: Final = 0.5

@@ -11,12 +11,10 @@ can use a name at a time.
 import asyncio
 import logging
 import time
-from collections import deque
 from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
-from contextlib import suppress
 from secrets import token_hex
 from types import TracebackType
-from typing import Any, Final, NamedTuple, Self
+from typing import Final, NamedTuple, Self
 
 from imud.fleet.accounts import (
     INCOMPLETE_MAX,
@@ -35,48 +33,28 @@ from imud.fleet.accounts import (
     placed,
 )
 from imud.fleet.broker import (
-    CONNECT_S,
-    LOST,
-    REFUSED,
-    UNANSWERED,
-    BrokerAccess,
     BrokerError,
     BrokerTurn,
     ReaderAccess,
     check_extra,
-    close_client,
-    connection_problem,
-    open_client,
-    paho_client,
 )
+from imud.fleet.connection import FleetDelivery, ReaderConnection
 from imud.fleet.messages import ROOT, STATE, FleetMessage, Stream, TopicParts, decode_message, parse_topic
 from imud.fleet.settings import Broker, broker_of, is_name
 from imud.model.errors import BadArgument
 from imud.model.units import NS_PER_S
 
-# Maximum number of messages without an acknowledgement. 1,000 gateways with two devices send this number per second.
-RECEIVE_MAX: Final = 2000
-# Maximum size of the waiting messages, bytes. A message with statistics usually has 4 kB, at most 130 kB.
-WAITING_BYTES: Final = 16 << 20
-# Maximum length of a message, bytes. A message of a gateway has at most 130 kB; the state of a hundred devices is
-# shorter.
-PACKET_BYTES: Final = 1_000_000
+log = logging.getLogger(__name__)
+
 # Maximum length of the stored states of all gateways, bytes: 10,000 gateways with 3 kB
 STATES_BYTES: Final = 32 << 20
-KEEP_ALIVE_S: Final = 30
-# Pause after received messages, s. Reading several messages together costs less than half of the CPU time per message.
-GATHER_S: Final = 0.01
-MISC_S: Final = 1.0  # interval of the keep-alive checks, s
-
-
-class FleetDelivery(NamedTuple):
-    """Message as the broker delivered it."""
-
-    topic: str
-    payload: bytes
-    retain: bool  # True if the broker stored the message (retained)
-    number: int  # packet identifier for the acknowledgement, valid in `connection`
-    connection: "ReaderConnection"
+# Time for which the broker keeps a named session without a connection, s. A broker can have a lower limit.
+SESSION_S: Final = 7 * 24 * 3600
+RETRY_MAX_S: Final = 60.0
+KEEP_BOOTS: Final = 10  # default number of boots of a gateway that stay in memory
+# Time without a message after which a boot with missing numbers leaves the memory, ns
+SILENT_NS: Final = 7 * 24 * 3600 * NS_PER_S
+VERSIONS: Final = ("5", "3.1.1")  # Supported versions of MQTT. The first is the default.
 
 
 def decode_delivery(delivery: FleetDelivery) -> tuple[TopicParts, FleetMessage | GatewayState]:
@@ -89,251 +67,6 @@ def decode_delivery(delivery: FleetDelivery) -> tuple[TopicParts, FleetMessage |
     if (message.gateway, message.device) != (parts.gateway, parts.device):
         raise ValueError(f"expected a message of {parts.gateway}/{parts.device}, got a message of another device")
     return parts, message
-
-
-class ReaderConnection:
-    """Connection to one broker. `open` creates it. Synchronization: the event loop's thread."""
-
-    def __init__(self, broker: Broker) -> None:
-        # Number of rejected messages with QoS 0. A broker can send any number of them without an acknowledgement.
-        self.refused = 0
-        self._broker = broker
-        self._queue: deque[FleetDelivery] = deque()
-        self._bytes = 0  # bytes of the messages in the queue
-        self._changed = asyncio.Event()
-        self._problem = ""
-        self._answered = False
-        self._awaited = 0  # number of topics without a SUBACK
-        self._client: Any = None
-        self._socket: Any = None
-        # True while the socket is not read: after received messages, or because the queue is full
-        self._is_paused = False
-        self._pause_timer: asyncio.TimerHandle | None = None
-        # descriptor of the socket: paho-mqtt can close the socket before the event loop removes it
-        self._descriptor = -1
-        self._timer: asyncio.TimerHandle | None = None
-
-    @classmethod
-    async def open(
-        cls,
-        broker: Broker,
-        access: BrokerAccess,
-        client_id: str,
-        topics: Sequence[str],
-        session_s: int,
-        *,
-        is_v5: bool = True,
-    ) -> "ReaderConnection":
-        """Connect and subscribe. Raises BrokerError. `session_s` is the time for which the broker keeps the session
-        without a connection, s; 0: no session. With MQTT 3.1.1 the configuration of the broker decides the time."""
-        self = cls(broker)
-        try:
-            await self._connect(access, client_id, session_s, is_v5=is_v5)
-            await self._until(lambda: self._answered, "no answer")
-            self._awaited = len(topics)
-            self._call_client(lambda: self._client.subscribe([(topic, 1) for topic in topics]))
-            self._watch_writable()
-            # SUBACK follows the messages of the session, and these can fill the queue
-            await self._until(lambda: not self._awaited or not self._has_room(), "no answer to the subscription")
-        except (OSError, ValueError) as error:
-            self.close()
-            raise BrokerError(f"{broker.name}: {connection_problem(error)}") from error
-        except BaseException:
-            self.close()
-            raise
-        return self
-
-    async def _connect(self, access: BrokerAccess, client_id: str, session_s: int, *, is_v5: bool) -> None:
-        client = paho_client(
-            self._broker, access, client_id, self, is_v5=is_v5, packet_bytes=PACKET_BYTES, session_s=session_s,
-            manual_ack=True,
-        )  # fmt: skip
-        client.max_inflight_messages_set(RECEIVE_MAX)
-        self._client = client
-        await asyncio.to_thread(open_client, client, self._broker, KEEP_ALIVE_S, RECEIVE_MAX, PACKET_BYTES, session_s)
-        self._socket = client.socket()
-        if self._socket is None:
-            raise BrokerError(f"{self._broker.name}: {LOST}")
-        client.on_socket_close = self._on_socket_close
-        self._descriptor = self._socket.fileno()
-        asyncio.get_running_loop().add_reader(self._descriptor, self._read)
-        self._check_keep_alive()
-
-    @property
-    def waiting(self) -> int:
-        """Return the number of waiting messages."""
-        return len(self._queue)
-
-    async def next(self, timeout_s: float | None = None) -> FleetDelivery | None:
-        """Return the next message; None after `timeout_s`. Raises BrokerError if the connection is lost."""
-        if not self._queue:
-            with suppress(TimeoutError):
-                await self._until(lambda: bool(self._queue), "", timeout_s)
-        found = self._queue.popleft() if self._queue else None
-        self._bytes -= len(found.payload) if found is not None else 0
-        self._continue_reading()
-        return found
-
-    def acknowledge(self, number: int) -> None:
-        """Acknowledge a message. Do nothing if the connection is lost."""
-        client = self._client
-        if client is not None and not self._problem:
-            self._call_client(lambda: client.ack(number, 1))
-            self._watch_writable()
-
-    def close(self) -> None:
-        """Send DISCONNECT and close the connection. The broker keeps the session. A second call does nothing."""
-        client, self._client = self._client, None
-        self._problem = self._problem or "the connection is closed"
-        self._changed.set()
-        for timer in (self._timer, self._pause_timer):
-            if timer is not None:
-                timer.cancel()
-        self._remove_socket()
-        if client is not None:
-            close_client(client)
-
-    # --- socket -------------------------------------------------------------------------------------------------------
-
-    async def _until(self, true: Any, problem: str, timeout_s: float | None = CONNECT_S) -> None:
-        """Wait until `true` returns True. Raises BrokerError; raises TimeoutError if `problem` is empty."""
-        try:
-            async with asyncio.timeout(timeout_s):
-                while not true():
-                    if self._problem:
-                        raise BrokerError(f"{self._broker.name}: {self._problem}")
-                    self._changed.clear()
-                    await self._changed.wait()
-        except TimeoutError:
-            if not problem:
-                raise
-            raise BrokerError(f"{self._broker.name}: {problem} within {timeout_s:g} s") from None
-
-    def _read(self) -> None:
-        """Let paho-mqtt read all pending data. After received messages, pause reading for GATHER_S."""
-        client, before = self._client, len(self._queue)
-        while client is not None:
-            known = len(self._queue)
-            self._call_client(client.loop_read)
-            has_more = len(self._queue) > known or self._pending()
-            if self._problem or not has_more or len(self._queue) > RECEIVE_MAX or self._bytes > WAITING_BYTES:
-                break
-        if self._socket is not None and len(self._queue) > before:
-            loop = asyncio.get_running_loop()
-            self._is_paused = True
-            loop.remove_reader(self._descriptor)
-            self._pause_timer = loop.call_later(GATHER_S, self._end_pause)
-        self._watch_writable()
-
-    def _end_pause(self) -> None:
-        self._pause_timer = None
-        self._continue_reading()
-
-    def _continue_reading(self) -> None:
-        """Continue to read after a pause if the queue has room."""
-        if self._is_paused and self._pause_timer is None and self._has_room() and self._socket is not None:
-            loop = asyncio.get_running_loop()
-            self._is_paused = False
-            loop.add_reader(self._descriptor, self._read)
-            if self._pending():  # the event loop cannot see bytes that the TLS library already read
-                loop.call_soon(self._read)
-
-    def _has_room(self) -> bool:
-        return len(self._queue) <= RECEIVE_MAX // 2 and self._bytes <= WAITING_BYTES // 2
-
-    def _pending(self) -> int:
-        """Return the number of bytes that the TLS library read from the socket but did not decode."""
-        return int(getattr(self._socket, "pending", lambda: 0)())
-
-    def _write(self) -> None:
-        if self._client is not None:
-            self._call_client(self._client.loop_write)
-            self._watch_writable()
-
-    def _watch_writable(self) -> None:
-        """Wait until the socket is writable if paho-mqtt has data to write."""
-        if self._socket is None:
-            return
-        loop = asyncio.get_running_loop()
-        if self._client.want_write():
-            loop.add_writer(self._descriptor, self._write)
-        else:
-            loop.remove_writer(self._descriptor)
-
-    def _check_keep_alive(self) -> None:
-        """Send and check keep-alives."""
-        self._timer = asyncio.get_running_loop().call_later(MISC_S, self._check_keep_alive)
-        # otherwise PINGRESP can be in the data that was not read, and paho-mqtt would report a timeout
-        if self._has_room():
-            self._call_client(self._client.loop_misc)
-        self._watch_writable()
-
-    def _call_client(self, work: Any) -> None:
-        """Call paho-mqtt. Store the problem if the call or the closed socket shows a lost connection."""
-        try:
-            work()
-        except (OSError, ValueError) as error:
-            self._problem = self._problem or connection_problem(error)
-        if self._client is not None and self._client.socket() is None:
-            self._problem = self._problem or (LOST if self._answered else UNANSWERED)
-        if self._problem:
-            self._remove_socket()
-            self._changed.set()
-
-    def _remove_socket(self) -> None:
-        """Remove the socket from the event loop. Its descriptor may be closed and belong to another file."""
-        sock, self._socket = self._socket, None
-        if sock is not None:
-            for forget in ("remove_reader", "remove_writer"):
-                with suppress(OSError, RuntimeError):  # RuntimeError: the event loop has ended
-                    getattr(asyncio.get_running_loop(), forget)(self._descriptor)
-
-    # --- callbacks of paho-mqtt ---------------------------------------------------------------------------------------
-
-    def _on_connect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
-        if reason.is_failure:
-            self._problem = f"the broker refuses the connection: {reason}"
-        self._answered = True
-        self._changed.set()
-
-    def _on_subscribe(self, _client: Any, _data: Any, _mid: int, reasons: Any, _properties: Any) -> None:
-        if len(reasons) != self._awaited:
-            self._problem = self._problem or (
-                f"expected {self._awaited} reason codes for subscriptions from the broker, got {len(reasons)}"
-            )
-        for reason in reasons:
-            if reason.value >= REFUSED:
-                self._problem = self._problem or f"the broker refuses a subscription: {reason}"
-        self._awaited = 0
-        self._changed.set()
-
-    def _on_message(self, _client: Any, _data: Any, message: Any) -> None:
-        if not message.qos:
-            self.refused += 1
-            return
-        self._bytes += len(message.payload)
-        self._queue.append(FleetDelivery(message.topic, message.payload, bool(message.retain), message.mid, self))
-        self._changed.set()
-
-    def _on_socket_close(self, _client: Any, _data: Any, _sock: Any) -> None:
-        """Remove the socket from the event loop before paho-mqtt closes its descriptor."""
-        self._remove_socket()
-        self._changed.set()
-
-    def _on_disconnect(self, _client: Any, _data: Any, flags: Any, reason: Any, _properties: Any) -> None:
-        if flags.is_disconnect_packet_from_server:
-            self._problem = self._problem or f"the broker ended the connection: {reason}"
-
-
-log = logging.getLogger(__name__)
-
-# Time for which the broker keeps a named session without a connection, s. A broker can have a lower limit.
-SESSION_S: Final = 7 * 24 * 3600
-RETRY_MAX_S: Final = 60.0
-KEEP_BOOTS: Final = 10  # default number of boots of a gateway that stay in memory
-# Time without a message after which a boot with missing numbers leaves the memory, ns
-SILENT_NS: Final = 7 * 24 * 3600 * NS_PER_S
-VERSIONS: Final = ("5", "3.1.1")  # Supported versions of MQTT. The first is the default.
 
 
 class FleetBatch(NamedTuple):
@@ -392,6 +125,7 @@ class Fleet:
         self.brokers: list[Broker] = brokers_of(urls)
         self.access = access or ReaderAccess()
         self.is_v5 = version == VERSIONS[0]
+        self.name = name
         self.session_s = SESSION_S if name else 0
         self.client_id = f"imud-reader-{name or token_hex(8)}"
         self.retry_max_s, self.now_ns = retry_max_s, now_ns
@@ -488,11 +222,43 @@ class Fleet:
             del self.states[oldest]
 
 
-class FleetSession:
-    """Session with the broker over several connections. Synchronization: one event loop."""
+class Share(NamedTuple):
+    """Share of a fleet. The broker divides the messages among the sessions of all shares (MQTT 5, section 4.8.2)."""
 
-    def __init__(self, fleet: Fleet, *, site: str | None, gateway: str | None, device: str | None) -> None:
+    number: int = 0
+    total: int = 1  # number of shares; 1: one session receives all messages
+
+    @property
+    def is_surplus(self) -> bool:
+        """Return whether the share belongs to an earlier, larger number of shares."""
+        return self.number >= self.total
+
+
+WHOLE: Final = Share()
+SHARES_MAX: Final = 64
+# Time without a message after which the session of a surplus share is empty, s. The broker sends waiting messages
+# immediately after each acknowledgement.
+DRAIN_S: Final = 5.0
+
+
+class FleetSession:
+    """Session with the broker over several connections. Synchronization: one event loop.
+
+    Share 0 also receives the states of the gateways, because a broker sends retained messages only to subscriptions
+    without a share. The session of a surplus share ends its subscriptions and receives only waiting messages.
+    """
+
+    def __init__(
+        self, fleet: Fleet, *, site: str | None, gateway: str | None, device: str | None, share: Share = WHOLE
+    ) -> None:
         """Select all gateways or devices with None. Raises BadArgument if a name is invalid."""
+        if share != WHOLE and not (fleet.session_s and fleet.is_v5):
+            raise BadArgument(
+                "expected MQTT 5 for several shares, got MQTT 3.1.1, which has no shared subscriptions; try one "
+                "collector for each site, with --site and its own --name"
+                if fleet.session_s
+                else "expected a name for several shares, got none"
+            )
         for what, given in (("site", site), ("gateway", gateway), ("device", device)):
             if given is not None and not is_name(given):
                 raise BadArgument(f"{what}: expected 1 to 64 letters, digits, '_' or '-', got {given!r}")
@@ -501,6 +267,9 @@ class FleetSession:
         self._turn = BrokerTurn(fleet.brokers, fleet.retry_max_s)
         self._connection: ReaderConnection | None = None
         self._again_ns = 0
+        self._share = share
+        self._open = 0  # number of messages of this connection without an acknowledgement
+        self._newest_ns = 0  # time of the last message, acknowledgement or connection
 
     async def __aenter__(self) -> Self:
         return self
@@ -523,6 +292,8 @@ class FleetSession:
             return None
         if delivery is None:
             return None
+        self._open += 1
+        self._newest_ns = fleet.now_ns()
         parts = parse_topic(delivery.topic)
         if parts is None or not self._is_wanted(parts):
             fleet.foreign += 1  # the session still has the subscription of an earlier reader with the same name
@@ -534,12 +305,24 @@ class FleetSession:
         """Acknowledge a message. The broker sends a message of an earlier connection again."""
         if delivery.connection is self._connection:
             self._connection.acknowledge(delivery.number)
+            self._open -= 1
+            self._newest_ns = self._fleet.now_ns()
+
+    @property
+    def is_drained(self) -> bool:
+        """Return whether the session of a surplus share is empty."""
+        connection = self._connection
+        if connection is None or not self._share.is_surplus:
+            return False
+        quiet_ns = self._fleet.now_ns() - self._newest_ns
+        return not connection.is_kept or (not self._open and quiet_ns > DRAIN_S * NS_PER_S)
 
     def close(self) -> None:
-        """Close the connection. The broker keeps a named session. A second call does nothing."""
+        """Close the connection. The broker keeps a named session, except a new session of a surplus share. A second
+        call does nothing."""
         connection, self._connection = self._connection, None
         if connection is not None:
-            connection.close()
+            connection.close(ends_session=self._share.is_surplus and not connection.is_kept)
 
     async def _connected(self, timeout_s: float | None) -> bool:
         """Connect if the pause is over. Return whether there is a connection. Raises BrokerError."""
@@ -551,8 +334,10 @@ class FleetSession:
             return False
         broker = self._turn.broker
         self._connection = await ReaderConnection.open(
-            broker, fleet.access, fleet.client_id, self._topics(), fleet.session_s, is_v5=fleet.is_v5
-        )
+            broker, fleet.access, self._client_id(), self._topics(), fleet.session_s, is_v5=fleet.is_v5,
+            former=self._former(),
+        )  # fmt: skip
+        self._open, self._newest_ns = 0, fleet.now_ns()
         self._turn.connected(fleet.now_ns())
         fleet.connections += 1
         fleet.problem = ""
@@ -569,11 +354,29 @@ class FleetSession:
             fleet.problem = str(error)
             log.warning("%s; trying again", error)
 
+    def _client_id(self) -> str:
+        """Return the name of the session on the broker. A name of a reader contains no period."""
+        return self._fleet.client_id + (f".{self._share.number}" if self._share.number else "")
+
     def _topics(self) -> list[str]:
         """Return the topics of the subscription: states and selected streams."""
+        if self._share.is_surplus:
+            return []
+        site, gateway, _ = (name or "+" for name in self._wanted)
+        states = [f"{ROOT}/{site}/{gateway}/{STATE}"] if self._share.number == 0 else []
+        return [*states, *self._streams(is_shared=self._share.total > 1)]
+
+    def _former(self) -> list[str]:
+        """Return the topics that the session can have from a reader with another number of shares."""
+        fleet, share = self._fleet, self._share
+        has_former = fleet.session_s and fleet.is_v5  # MQTT 3.1.1 has no shares
+        return self._streams(is_shared=share.total == 1 or share.is_surplus) if has_former else []
+
+    def _streams(self, *, is_shared: bool) -> list[str]:
         site, gateway, device = (name or "+" for name in self._wanted)
-        base = f"{ROOT}/{site}/{gateway}"
-        topics = [f"{base}/{STATE}", *(f"{base}/{device}/{stream}" for stream in Stream)]
+        group = f"$share/{self._fleet.name}/" if is_shared else ""
+        base = f"{group}{ROOT}/{site}/{gateway}"
+        topics = [f"{base}/{device}/{stream}" for stream in Stream]
         return topics if self._wanted[2] is not None else [*topics, f"{base}/{Stream.EVENTS}"]
 
     def _is_wanted(self, parts: TopicParts) -> bool:

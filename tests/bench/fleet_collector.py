@@ -20,9 +20,10 @@ import msgspec
 
 from imud.fleet.accounts import StreamCounts
 from imud.fleet.collector import GC_ALLOCATIONS, FleetCollector, FleetStore, LedgerStore, Offsets
+from imud.fleet.connection import FleetDelivery
 from imud.fleet.database.store import PostgresStore
 from imud.fleet.messages import MAGIC
-from imud.fleet.reader import VERSIONS, Fleet, FleetBatch, FleetDelivery
+from imud.fleet.reader import VERSIONS, Fleet, FleetBatch
 from imud.host.threads import rare_garbage_collection
 from imud.model.units import NS_PER_MS
 

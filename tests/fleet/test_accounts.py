@@ -27,6 +27,7 @@ from imud.fleet.accounts import (
     offset_of,
     placed,
 )
+from imud.fleet.connection import FleetDelivery, ReaderConnection
 from imud.fleet.messages import (
     VERSION,
     DropCause,
@@ -37,7 +38,7 @@ from imud.fleet.messages import (
     Stream,
     encode_message,
 )
-from imud.fleet.reader import Fleet, FleetDelivery, ReaderConnection
+from imud.fleet.reader import Fleet
 from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_S
 from tests.fleet.fleet_gateway import UTC_NS, event_message, intervals_message, not_set, samples_message, synchronised

@@ -22,7 +22,7 @@ import pytest
 
 from imud.fleet import broker as fleet_broker
 from imud.fleet.broker import BrokerError, BrokerTurn, MessageRefused, PahoConnection, Will, paho_client
-from imud.fleet.reader import ReaderConnection
+from imud.fleet.connection import ReaderConnection
 from imud.fleet.settings import Broker, MqttOptions, broker_of
 from tests.fleet.authority import Authority
 from tests.fleet.mosquitto import NO_MOSQUITTO, Collector, running_broker

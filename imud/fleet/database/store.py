@@ -16,6 +16,7 @@ from contextlib import nullcontext, suppress
 from typing import Any, Final, TypeVar
 
 from imud.fleet.accounts import BOOTS_MAX, BootKey, BootOffset
+from imud.fleet.connection import FleetDelivery
 from imud.fleet.database.rows import TableRows, columns_of
 from imud.fleet.database.settings import CollectorSettings
 from imud.fleet.database.transaction import (
@@ -28,7 +29,7 @@ from imud.fleet.database.transaction import (
 )
 from imud.fleet.database.upkeep import Upkeep
 from imud.fleet.messages import FleetMessage
-from imud.fleet.reader import FleetDelivery, decode_delivery
+from imud.fleet.reader import decode_delivery
 from imud.host.installation import needs_extra
 from imud.model.errors import ServerError
 from imud.model.units import NS_PER_S

@@ -29,10 +29,11 @@ from imud.fleet.accounts import (
     clock_offset,
     offset_of,
 )
+from imud.fleet.connection import FleetDelivery
 from imud.fleet.database.rows import Names, TableRows, TurnRows
 from imud.fleet.database.tables import TIMED, FleetTable
 from imud.fleet.messages import FleetMessage, Stream
-from imud.fleet.reader import FleetBatch, FleetDelivery
+from imud.fleet.reader import FleetBatch
 
 Offsets = Mapping[BootKey, BootOffset]
 

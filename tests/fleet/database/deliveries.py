@@ -7,9 +7,10 @@ from typing import Any
 import msgspec
 
 from imud.fleet.accounts import GatewayState
+from imud.fleet.connection import FleetDelivery, ReaderConnection
 from imud.fleet.database.store import PostgresStore
 from imud.fleet.messages import FleetMessage, MessageKind, Stream, encode_message, topic_of
-from imud.fleet.reader import FleetDelivery, ReaderConnection, brokers_of
+from imud.fleet.reader import brokers_of
 
 STREAMS = {MessageKind.INTERVALS: Stream.STATISTICS, MessageKind.EVENTS: Stream.EVENTS}
 BALANCE = "newest - begin + 1 - whole - thinned - dropped - missing"

@@ -134,7 +134,9 @@ def test_hours_and_days_have_weighted_statistics(cursor: Any) -> None:
         ("2026-01-01 05:30:00+05:30", *key, "statistics", 8, 7.0, -10.0, 10.0, 7.713624310270756, 20.0, None),
         ("2026-01-01 05:30:00+05:30", *key, "samples", 7, 3.0, 3.0, 3.0, 3.0, None, None),
     ]
-    cursor.execute("SELECT roll_mean_rad, roll_min_rad, roll_max_rad FROM imud_intervals_1h WHERE samples = 4 ORDER BY time")
+    cursor.execute(
+        "SELECT roll_mean_rad, roll_min_rad, roll_max_rad FROM imud_intervals_1h WHERE samples = 4 ORDER BY time"
+    )
     first, second = cursor.fetchall()
     assert first == pytest.approx((0.5, 0.5, 0.5))
     assert second == pytest.approx((0.1 - math.pi, 0.4 - math.pi, math.pi - 0.2))
