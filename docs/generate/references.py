@@ -37,6 +37,7 @@ from imud.contracts.lines import LINE_SCHEMAS, DeviceLines
 from imud.contracts.status import Deviations
 from imud.device.settings_plan import described_settings
 from imud.drivers import DRIVERS
+from imud.fleet.database.settings import CollectorSettings
 from imud.fleet.database.tables import COMPONENTS, Column
 from imud.fleet.database.tables import TABLES as DATABASE_TABLES
 from imud.fleet.database.views import views
@@ -208,6 +209,18 @@ def settings_tables() -> str:
     declared = "[device settings of each driver](settings.md#the-settings-of-each-driver)"
     text += [f"### `devices.NAME.settings.…`: {declared}", ""]
     return "\n".join(text)
+
+
+# --- docs/fleet.md ----------------------------------------------------------------------------------------------------
+
+
+def collector_table() -> str:
+    docs, lists = docs_of(CollectorSettings), LongLists()
+    rows = ["| key | values | default | meaning |", "|---|---|---|---|"]
+    for field in msgspec.structs.fields(CollectorSettings):
+        values = lists.cell(expected(field.type), f"`{field.name}`")
+        rows.append(f"| `{field.name}` | {values} | {default_of(field)} | {docs[field.name]} |")
+    return "\n".join(rows)
 
 
 # --- docs/commands.md -------------------------------------------------------------------------------------------------
@@ -470,6 +483,7 @@ def simulators_table() -> str:
 
 PAGES: Final[Mapping[str, Callable[[], Mapping[str, str]]]] = {
     "docs/configuration.md": lambda: {"keys": "\n" + settings_tables()},
+    "docs/fleet.md": lambda: {"collector": collector_table()},
     "docs/commands.md": lambda: {"actions": "\n" + actions_tables()},
     "docs/calibration.md": lambda: {"calibrations": calibrations_table()},
     "docs/settings.md": lambda: {"settings": "\n" + device_settings_tables()},

@@ -10,19 +10,22 @@ from contextlib import closing, suppress
 from time import monotonic_ns, time_ns
 from typing import Final, Protocol
 
+import msgspec
+
 from imud.cli.arguments import CliCommand, add_duration
 from imud.cli.output import complain, table
 from imud.config import load_options
 from imud.fleet.accounts import GatewayState, StreamAccount, StreamKey
 from imud.fleet.broker import ReaderAccess
-from imud.fleet.collector import GC_ALLOCATIONS, FleetCollector, FleetStore, JsonLines, LedgerStore, Selection
+from imud.fleet.collector import GC_ALLOCATIONS, FleetCollector, JsonLines, LedgerStore, Selection
 from imud.fleet.database.settings import CollectorSettings
-from imud.fleet.database.store import PostgresStore
 from imud.fleet.influx import InfluxStore
 from imud.fleet.messages import GatewayClock, Stream
-from imud.fleet.reader import VERSIONS, Fleet, FleetBatch
+from imud.fleet.reader import SHARES_MAX, VERSIONS, Fleet, FleetBatch
+from imud.fleet.shares import FleetShares
 from imud.host.http_post import HttpPost, PostAccess, post_url
 from imud.host.installation import needs_extra
+from imud.host.log import STDERR, log_to
 from imud.host.threads import rare_garbage_collection
 from imud.model.errors import BadArgument
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
@@ -250,6 +253,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "message",
     )  # fmt: skip
     collecting.add_argument(
+        "--shares", type=int, metavar="N",
+        help=f"for a postgresql URL: divide the messages among N sessions, 1 to {SHARES_MAX} (default: 1); start the "
+        "same command on several hosts, and each collector takes its part",
+    )  # fmt: skip
+    collecting.add_argument(
         "--config", metavar="FILE", help="for a postgresql URL: settings of the collector and its database (YAML)"
     )
     showing = actions.add_parser("top", help="show all gateways in a full-screen view of the terminal")
@@ -298,18 +306,27 @@ def fleet_of(args: argparse.Namespace, name: str, *, from_begin: bool) -> Fleet:
 
 async def _collect(args: argparse.Namespace) -> int:
     fleet = fleet_of(args, args.name, from_begin=args.from_begin)
-    store = store_of(args, fleet)
-    collector = FleetCollector(fleet, store, Selection(args.site, args.gateway, args.device))
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, collector.stop)
+    selection = Selection(args.site, args.gateway, args.device)
+    is_postgres = args.to.startswith(("postgresql://", "postgres://"))
+    if not is_postgres and not (args.config is None and args.shares is None):
+        raise BadArgument("--config, --shares: expected --to with a postgresql URL")
+    store = None if is_postgres else store_of(args, fleet)
     try:
+        collector = (
+            FleetShares(fleet, args.to, settings_of(args), selection, from_begin=args.from_begin)
+            if store is None
+            else FleetCollector(fleet, store, selection)
+        )
+        for number in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(number, collector.stop)
         # collections would take a large share of the CPU time at high rates
-        with rare_garbage_collection(GC_ALLOCATIONS):
+        with log_to(STDERR, "info"), rare_garbage_collection(GC_ALLOCATIONS):
             await collector.run(stop_after_s=args.duration)
-        for line in _results(fleet, store):
+        for line in _results(fleet, collector, store):
             print(line, file=sys.stderr)
     finally:
-        store.close()
+        if store is not None:
+            store.close()
     if fleet.ignored:
         print(f"{fleet.ignored} messages were invalid and not stored; the log names them", file=sys.stderr)
     if fleet.problem:
@@ -317,10 +334,10 @@ async def _collect(args: argparse.Namespace) -> int:
     return 1 if fleet.problem else 0
 
 
-def _results(fleet: Fleet, store: FleetStore) -> Iterator[str]:
+def _results(fleet: Fleet, collector: FleetShares | FleetCollector, store: LedgerStore | None) -> Iterator[str]:
     """Yield the ledger and the rejected messages at the end of `collect`."""
-    if isinstance(store, PostgresStore):
-        yield store.ledger_text()
+    if isinstance(collector, FleetShares):
+        yield collector.ledger_text()
     elif ledger := account_table(fleet.accounts):
         yield ledger
     if fleet.expired_boots or fleet.ledger.removed_streams:
@@ -328,25 +345,29 @@ def _results(fleet: Fleet, store: FleetStore) -> Iterator[str]:
             f"not in the table: {fleet.expired_boots} old boots ({fleet.expired_incomplete} with missing numbers), "
             f"{fleet.ledger.removed_streams} streams above the limit of the memory"
         )
-    if isinstance(store, LedgerStore) and isinstance(store.to, InfluxStore) and store.to.refused:
+    if store is not None and isinstance(store.to, InfluxStore) and store.to.refused:
         yield f"the server rejected {store.to.refused} messages; the log has the reasons"
 
 
-def store_of(args: argparse.Namespace, fleet: Fleet) -> FleetStore:
-    """Open the store of `--to`. Raises BadArgument, ConfigError, ServerError."""
+def settings_of(args: argparse.Namespace) -> CollectorSettings:
+    """Return the settings of --config and --shares. Raises BadArgument, ConfigError."""
+    settings = CollectorSettings() if args.config is None else load_options(args.config, CollectorSettings)
+    if args.shares is None:
+        return settings
+    if not 1 <= args.shares <= SHARES_MAX:
+        raise BadArgument(f"--shares: expected 1 to {SHARES_MAX}, got {args.shares}")
+    return msgspec.structs.replace(settings, shares=args.shares)
+
+
+def store_of(args: argparse.Namespace, fleet: Fleet) -> LedgerStore:
+    """Open a store without a ledger of its own. Raises BadArgument, ServerError."""
     url, access = post_url(args.to), PostAccess(args.to_token_file, args.to_ca_file)
-    is_postgres = args.to.startswith(("postgresql://", "postgres://"))
-    if args.config is not None and not is_postgres:
-        raise BadArgument("--config: expected --to with a postgresql URL")
     if url is not None:
         return LedgerStore(fleet, InfluxStore(HttpPost(url, access)))
     if access != OPEN:
         raise BadArgument("--to-token-file, --to-ca-file: expected --to with an http or https URL")
     if args.to == "-":
         return LedgerStore(fleet, JsonLines(sys.stdout))
-    if is_postgres:
-        settings = CollectorSettings() if args.config is None else load_options(args.config, CollectorSettings)
-        return PostgresStore(args.to, settings, from_begin=args.from_begin)
     raise BadArgument(
         "--to: expected - for standard output, a URL like postgresql://USER@HOST/DATABASE, or a write URL like "
         "http://HOST:8086/write?db=imud without user, password and token"

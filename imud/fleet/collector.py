@@ -17,7 +17,7 @@ import msgspec
 from imud.fleet.accounts import BootKey, BootOffset, PlacedTime
 from imud.fleet.connection import RECEIVE_MAX, FleetDelivery
 from imud.fleet.messages import Interval, MessageKind
-from imud.fleet.reader import Fleet, FleetBatch, FleetSession
+from imud.fleet.reader import WHOLE, Fleet, FleetBatch, FleetSession, Share
 from imud.model.units import NS_PER_S
 
 COMMIT_S: Final = 0.5
@@ -86,13 +86,22 @@ class Selection(NamedTuple):
 EVERYTHING: Final = Selection()
 
 
+def session_of(fleet: Fleet, selection: Selection, share: Share) -> FleetSession:
+    """Return the session of a share. Raises BadArgument if a name or the share is invalid."""
+    site, gateway, device = selection
+    return FleetSession(fleet, site=site, gateway=gateway, device=device, share=share)
+
+
 class FleetCollector:
     """One run of the collector. Synchronization: one event loop, also for `stop`."""
 
     def __init__(
-        self, fleet: Fleet, store: FleetStore, selection: Selection = EVERYTHING,
+        self, fleet: Fleet, store: FleetStore, selection: Selection = EVERYTHING, share: Share = WHOLE,
     ) -> None:  # fmt: skip
-        self._fleet, self._store, self._selection, self._now_ns = fleet, store, selection, fleet.now_ns
+        """Raises BadArgument if a name of the selection or the share is invalid."""
+        self.session = session_of(fleet, selection, share)
+        self.is_drained = False  # True after `run` of a surplus share that received all waiting messages
+        self._store, self._now_ns = store, fleet.now_ns
         self._stopped = False
 
     def stop(self) -> None:
@@ -102,16 +111,16 @@ class FleetCollector:
     async def run(self, *, stop_after_s: float | None = None) -> None:
         """Collect until `stop`, or for `stop_after_s`. Raises ServerError or OSError if the store fails."""
         end_ns = None if stop_after_s is None else self._now_ns() + round(stop_after_s * NS_PER_S)
-        site, gateway, device = self._selection
-        async with FleetSession(self._fleet, site=site, gateway=gateway, device=device) as session:
+        async with self.session as session:
             writing: asyncio.Future[None] | None = None
             try:
-                while not self._stopped and (end_ns is None or self._now_ns() < end_ns):
+                while not (self._stopped or self.is_drained) and (end_ns is None or self._now_ns() < end_ns):
                     turn = await self._take(session)
                     if writing is not None:
                         # a cancelled `run` must not stop the write that is running
                         await asyncio.shield(writing)
                     writing = asyncio.ensure_future(self._write(session, turn))
+                    self.is_drained = session.is_drained
             finally:
                 if writing is not None:
                     await writing

@@ -267,7 +267,8 @@ class FleetSession:
         self._turn = BrokerTurn(fleet.brokers, fleet.retry_max_s)
         self._connection: ReaderConnection | None = None
         self._again_ns = 0
-        self._share = share
+        self.is_kept = False  # True if the broker had the session before the newest connection
+        self.share = share
         self._open = 0  # number of messages of this connection without an acknowledgement
         self._newest_ns = 0  # time of the last message, acknowledgement or connection
 
@@ -311,18 +312,17 @@ class FleetSession:
     @property
     def is_drained(self) -> bool:
         """Return whether the session of a surplus share is empty."""
-        connection = self._connection
-        if connection is None or not self._share.is_surplus:
+        if self._connection is None or not self.share.is_surplus:
             return False
         quiet_ns = self._fleet.now_ns() - self._newest_ns
-        return not connection.is_kept or (not self._open and quiet_ns > DRAIN_S * NS_PER_S)
+        return not self.is_kept or (not self._open and quiet_ns > DRAIN_S * NS_PER_S)
 
     def close(self) -> None:
         """Close the connection. The broker keeps a named session, except a new session of a surplus share. A second
         call does nothing."""
         connection, self._connection = self._connection, None
         if connection is not None:
-            connection.close(ends_session=self._share.is_surplus and not connection.is_kept)
+            connection.close(ends_session=self.share.is_surplus and not self.is_kept)
 
     async def _connected(self, timeout_s: float | None) -> bool:
         """Connect if the pause is over. Return whether there is a connection. Raises BrokerError."""
@@ -337,6 +337,7 @@ class FleetSession:
             broker, fleet.access, self._client_id(), self._topics(), fleet.session_s, is_v5=fleet.is_v5,
             former=self._former(),
         )  # fmt: skip
+        self.is_kept = self._connection.is_kept
         self._open, self._newest_ns = 0, fleet.now_ns()
         self._turn.connected(fleet.now_ns())
         fleet.connections += 1
@@ -356,19 +357,19 @@ class FleetSession:
 
     def _client_id(self) -> str:
         """Return the name of the session on the broker. A name of a reader contains no period."""
-        return self._fleet.client_id + (f".{self._share.number}" if self._share.number else "")
+        return self._fleet.client_id + (f".{self.share.number}" if self.share.number else "")
 
     def _topics(self) -> list[str]:
         """Return the topics of the subscription: states and selected streams."""
-        if self._share.is_surplus:
+        if self.share.is_surplus:
             return []
         site, gateway, _ = (name or "+" for name in self._wanted)
-        states = [f"{ROOT}/{site}/{gateway}/{STATE}"] if self._share.number == 0 else []
-        return [*states, *self._streams(is_shared=self._share.total > 1)]
+        states = [f"{ROOT}/{site}/{gateway}/{STATE}"] if self.share.number == 0 else []
+        return [*states, *self._streams(is_shared=self.share.total > 1)]
 
     def _former(self) -> list[str]:
         """Return the topics that the session can have from a reader with another number of shares."""
-        fleet, share = self._fleet, self._share
+        fleet, share = self._fleet, self.share
         has_former = fleet.session_s and fleet.is_v5  # MQTT 3.1.1 has no shares
         return self._streams(is_shared=share.total == 1 or share.is_surplus) if has_former else []
 

@@ -77,6 +77,12 @@ def test_arguments_are_checked(cli: Cli) -> None:
         (["collect", "mqtt://host", "--to", "elsewhere"], "--to: expected"),
         (["collect", "mqtt://host", "--to", "postgresql://127.0.0.1:1/a"], "PostgreSQL: "),
         (["collect", "mqtt://host", "--to", "postgres://127.0.0.1:1/a"], "PostgreSQL: "),
+        (["collect", "mqtt://host", "--to", "-", "--shares", "2"], "--config, --shares: expected --to with a postgres"),
+        (["collect", "mqtt://host", "--to", "postgresql:///a", "--shares", "65"], "--shares: expected 1 to 64, got 65"),
+        (
+            ["collect", "mqtt://host", "--to", "postgresql:///a", "--shares", "2", "--mqtt-version", "3.1.1"],
+            "expected MQTT 5 for several shares, got MQTT 3.1.1",
+        ),
         (["collect", "host", "--to", "-"], "expected a URL"),
         (["collect", "mqtt://host", "--to", "-", "--password-file", "f"], "add --user"),
         (["collect", "mqtt://host", "--to", "-", "--key-file", "f"], "add --cert-file"),

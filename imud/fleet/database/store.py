@@ -1,4 +1,4 @@
-"""Store of `imud fleet collect --to postgresql://…`: connection, lease, repeated transactions and rejected messages.
+"""Store of `imud fleet collect --to postgresql://…`: connection, repeated transactions and rejected messages.
 
     messages ──▶ FleetTransaction ──▶ COMMIT ──▶ (the collector) acknowledge
 
@@ -63,90 +63,73 @@ _FORGET_REJECTED: Final = (
 )
 
 
-class LeaseLost(ServerError):
-    """The connection ended, and with it the lease. The lease can belong to another collector now."""
+def connected(url: str) -> Any:
+    """Connect to a database. Both sides detect a dead host within DEAD_S. Raises ServerError."""
+    import psycopg
+
+    keep_alive: dict[str, Any] = {f"keepalives_{name}": value for name, value in KEEP_ALIVE.items()}
+    try:
+        connection = psycopg.connect(
+            url, connect_timeout=CONNECT_S, application_name="imud fleet collect", client_encoding="utf8",
+            tcp_user_timeout=DEAD_S * 1000, **keep_alive,
+        )  # fmt: skip
+        # a statement after a lock must see the rows that the transaction before it stored
+        connection.isolation_level = psycopg.IsolationLevel.READ_COMMITTED
+        with connection.transaction(), connection.cursor() as cursor:
+            for name, value in KEEP_ALIVE.items():
+                cursor.execute(f"SET tcp_keepalives_{name} = {value}".encode())
+            cursor.execute(f"SET tcp_user_timeout = {DEAD_S * 1000}".encode())
+    except psycopg.ProgrammingError as error:
+        if error.sqlstate is not None:  # an error of the server, not of the URL
+            raise ServerError(f"PostgreSQL: {sentence_of(error)}") from error
+        raise ServerError(
+            f"PostgreSQL: cannot parse the URL: {_unquoted(error)}; imud does not show it because of its password"
+        ) from None
+    except psycopg.Error as error:
+        raise ServerError(f"PostgreSQL: {sentence_of(error)}") from error
+    return connection
 
 
 class PostgresStore:
     """Store in a PostgreSQL database. Synchronization: one thread at a time."""
 
     def __init__(
-        self, url: str, settings: CollectorSettings = CollectorSettings(), lease: str = "", *,  # noqa: B008
+        self, url: str, settings: CollectorSettings = CollectorSettings(), *,  # noqa: B008
         from_begin: bool = False, now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:  # fmt: skip
-        """Connect and create missing tables. `lease` is the name of the lease that `take_lease` takes; empty: none.
-        With `from_begin`, numbers before the first message of a stream count as missing. Raises ServerError."""
+        """Connect and create missing tables. With `from_begin`, numbers before the first message of a stream count as
+        missing. Raises ServerError."""
         with needs_extra("fleet", ServerError):
             import psycopg
         self.counts = StoreCounts()  # since the start of this process
-        self._url, self._lease, self._from_begin, self._now_ns = url, lease, from_begin, now_ns
+        self._url, self._from_begin, self._now_ns = url, from_begin, now_ns
         self._error: type[Exception] = psycopg.Error
         self._conflict: type[Exception] = psycopg.errors.UniqueViolation
-        self._has_lease = False
         self._offsets: dict[BootKey, BootOffset] = {}  # newest clock offsets of boots with an offset in the database
         self._upkeep = Upkeep(settings)
         self._upkeep_ns = now_ns()
         self._connect()
 
-    # --- connection and lease -----------------------------------------------------------------------------------------
+    # --- connection ---------------------------------------------------------------------------------------------------
 
     def _connect(self) -> None:
-        import psycopg
-
-        keep_alive: dict[str, Any] = {f"keepalives_{name}": value for name, value in KEEP_ALIVE.items()}
+        self._connection = connected(self._url)
         try:
-            self._connection: Any = psycopg.connect(
-                self._url, connect_timeout=CONNECT_S, application_name="imud fleet collect", client_encoding="utf8",
-                tcp_user_timeout=DEAD_S * 1000, **keep_alive,
-            )  # fmt: skip
-            # a statement after a lock must see the rows that the transaction before it stored
-            self._connection.isolation_level = psycopg.IsolationLevel.READ_COMMITTED
             with self._connection.transaction(), self._connection.cursor() as cursor:
-                for name, value in KEEP_ALIVE.items():
-                    cursor.execute(f"SET tcp_keepalives_{name} = {value}")
-                cursor.execute(f"SET tcp_user_timeout = {DEAD_S * 1000}")
                 cursor.execute(f"SET lock_timeout = '{round(LOCK_S * 1000)}ms'")
+                # release the locks of rows if this process stops within a transaction
+                cursor.execute(f"SET idle_in_transaction_session_timeout = {DEAD_S * 1000}")
             with self._connection.transaction(), self._connection.cursor() as cursor:
                 self._upkeep.prepare(cursor)
-        except psycopg.ProgrammingError as error:
+        except self._error as error:
             self.close()
-            if error.sqlstate is not None:  # an error of the server, not of the URL
-                raise ServerError(f"PostgreSQL: {_sentence(error)}") from error
-            raise ServerError(
-                f"PostgreSQL: cannot parse the URL: {_unquoted(error)}; imud does not show it because of its password"
-            ) from None
-        except psycopg.Error as error:
-            self.close()
-            raise ServerError(f"PostgreSQL: {_sentence(error)}") from error
+            raise ServerError(f"PostgreSQL: {sentence_of(error)}") from error
         except ServerError:
             self.close()
             raise
 
-    def take_lease(self) -> bool:
-        """Acquire the lease until the connection ends. Return False if it belongs to another connection. Raises
-        ServerError."""
-        if self._has_lease:
-            return True
-        try:
-            self._try_lease()
-        except ServerError:
-            # a connection without a lease can be replaced
-            if not self._connection.closed:
-                raise
-            self._connect()
-            self._try_lease()
-        return self._has_lease
-
-    def _try_lease(self) -> None:
-        def lock(cursor: Any) -> bool:
-            cursor.execute("SELECT pg_try_advisory_lock(hashtextextended(%s, 0))", (self._lease,))
-            return bool(cursor.fetchone()[0])
-
-        self._has_lease = self._transact(lock)
-
     def close(self) -> None:
         """Close the connection. A second call does nothing."""
-        self._has_lease = False
         connection = getattr(self, "_connection", None)
         if connection is not None:
             with suppress(self._error):
@@ -155,17 +138,13 @@ class PostgresStore:
     # --- messages -----------------------------------------------------------------------------------------------------
 
     def write(self, deliveries: Sequence[FleetDelivery]) -> None:
-        """Store messages in one transaction. Without messages, check the lease and do the upkeep. Raises LeaseLost if
-        the connection ended and the store had the lease, otherwise ServerError."""
+        """Store messages in one transaction, and do the upkeep. Raises ServerError."""
         items, invalid = _decoded(deliveries)
         try:
             self._write(items, invalid)
         except ServerError as error:
             if not self._connection.closed:
                 raise
-            if self._has_lease:
-                self._has_lease = False
-                raise LeaseLost(str(error)) from error
             self._connect_again(error)
             self._write(items, invalid)
 
@@ -206,8 +185,6 @@ class PostgresStore:
         if self._now_ns() >= self._upkeep_ns:
             self._upkeep_ns = self._now_ns() + UPKEEP_NS
             self._run_upkeep()
-        elif self._has_lease and not items:
-            self._transact(lambda cursor: cursor.execute("SELECT 1"))
 
     def _store(self, items: Sequence[DecodedDelivery]) -> None:
         """Store messages in one transaction. Store halves if a value cannot be stored. Raises ServerError."""
@@ -218,9 +195,9 @@ class PostgresStore:
                 self._store_with(insert_new_rows, items)
         except (self._error, ValueError, OverflowError) as error:
             if isinstance(error, self._error) and not _sqlstate(error).startswith(OF_VALUES):
-                raise ServerError(f"PostgreSQL: {_sentence(error)}") from error
+                raise ServerError(f"PostgreSQL: {sentence_of(error)}") from error
             if len(items) == 1:
-                self._reject([(items[0].delivery, _sentence(error))])
+                self._reject([(items[0].delivery, sentence_of(error))])
                 return
             middle = len(items) // 2
             self._store(items[:middle])
@@ -247,7 +224,7 @@ class PostgresStore:
             except (self._error, RowRemoved) as error:
                 if isinstance(error, self._error) and _sqlstate(error) not in OF_CONFLICTS:
                     raise
-                log.warning("PostgreSQL: %s; attempt %d of %d", _sentence(error), attempt + 1, CONFLICTS_MAX)
+                log.warning("PostgreSQL: %s; attempt %d of %d", sentence_of(error), attempt + 1, CONFLICTS_MAX)
         raise ServerError(
             f"PostgreSQL: cannot store messages after {CONFLICTS_MAX} conflicts with other transactions; see "
             "pg_stat_activity"
@@ -258,7 +235,7 @@ class PostgresStore:
         try:
             return self._repeated(work)
         except self._error as error:
-            raise ServerError(f"PostgreSQL: {_sentence(error)}") from error
+            raise ServerError(f"PostgreSQL: {sentence_of(error)}") from error
 
     def _reject(self, invalid: Sequence[tuple[FleetDelivery, str]]) -> None:
         """Store messages in the table `imud_rejected`. Raises ServerError."""
@@ -310,10 +287,11 @@ def _storable(text: str) -> str:
     return text.encode("utf-8", "backslashreplace").decode().replace("\0", "\\0")[:REASON_CHARACTERS]
 
 
-def _sentence(error: BaseException) -> str:
+def sentence_of(error: BaseException) -> str:
+    """Return the text of an error as one line."""
     return " ".join(str(error).split()) or type(error).__name__
 
 
 def _unquoted(error: BaseException) -> str:
     """Return the problem without the part of the URL that libpq quotes."""
-    return _sentence(error).partition('"')[0].rstrip(": ")
+    return sentence_of(error).partition('"')[0].rstrip(": ")

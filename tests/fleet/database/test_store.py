@@ -13,7 +13,7 @@ import pytest
 
 from imud.fleet import messages as fleet_messages
 from imud.fleet.accounts import GatewayState
-from imud.fleet.database.store import LeaseLost, PostgresStore
+from imud.fleet.database.store import PostgresStore
 from imud.fleet.messages import MessageKind
 from imud.fleet.statistics import SCALARS, VECTORS
 from imud.model.errors import ServerError
@@ -240,23 +240,6 @@ def test_a_lost_connection_is_replaced(caplog: pytest.LogCaptureFixture) -> None
     assert caplog.text.count("connecting again") == 2
 
 
-def test_one_store_at_a_time_has_a_lease(database: str) -> None:
-    first, second, third = stores = [PostgresStore(database, lease=lease) for lease in ("a", "a", "b")]
-    assert [one.take_lease() for one in (first, first, second, third)] == [True, True, False, True]
-    query(database, CUT)
-    with pytest.raises(LeaseLost):
-        first.write(deliveries(samples_message(1, 5)))
-    with pytest.raises(LeaseLost):
-        third.write([])
-    assert not query(database, "SELECT 1 FROM imud_samples")
-    assert (second.take_lease(), first.take_lease()) == (True, False), "both connected again"
-    second.write(deliveries(samples_message(1, 5)))
-    second.close()
-    assert first.take_lease()
-    for one in stores:
-        one.close()
-
-
 def test_a_transaction_that_fails_leaves_nothing(database: str) -> None:
     write(database)
     query(database, "ALTER TABLE imud_ledger ADD CHECK (device <> 'bow')")
@@ -373,9 +356,8 @@ def test_rows_are_exactly_once_when_the_server_is_killed(broker: Mosquitto, gate
                     )  # fmt: skip
                 server.kill()
                 holder.close()
-                assert collecting.process.wait(LIMIT_S) == 2
                 server.start()
-                collecting.start()
+            assert collecting.process.poll() is None, "the collector waits for the database"
             collecting.settle(sent)
             assert_exactly_once(server.url, sent)
         finally:
