@@ -14,6 +14,7 @@
 # make mqtt-deps   installs mosquitto and nats-server, for the tests of the output mqtt and these:
 # make fleet-demo    a broker, three gateways with a simulated sensor each, and `imud fleet top` on them
 # make fleet-faults  a gateway, a broker and what can happen between them (ARGS="--seconds 120"), as a table
+# make fleet-collectors  three collectors divide a fleet, and SIGKILL ends one of them every 20 s
 # make fleet-load    1,000 simulated gateways, one broker, one collector   make fleet-cluster  three NATS servers, one is killed
 # make bench-instructions   instructions per sample, beside those kept in the tree; make bench-deps   what it needs
 # make web-deps   installs chromium and its driver, for the tests of the page of `imud web`
@@ -138,7 +139,7 @@ audit: $(VENV)/made
 attack: $(VENV)/made
 	$(BIN)/python -m tests.attack $(ARGS)
 
-.PHONY: fleet-demo fleet-faults fleet-load fleet-cluster
+.PHONY: fleet-demo fleet-faults fleet-load fleet-cluster fleet-collectors
 fleet-demo: $(VENV)/made
 	$(BIN)/python -m tests.fleet.demo $(ARGS)
 
@@ -147,6 +148,9 @@ fleet-faults: $(VENV)/made
 
 fleet-load: $(VENV)/made
 	$(BIN)/python -m tests.bench.fleet_load $(ARGS)
+
+fleet-collectors: $(VENV)/made
+	$(BIN)/python -m tests.bench.fleet_collectors $(ARGS)
 
 fleet-cluster: $(VENV)/made
 	$(BIN)/python -m tests.bench.fleet_load --cluster --gateways 200 $(ARGS)

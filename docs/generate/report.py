@@ -144,6 +144,14 @@ SUBJECTS: Final[Mapping[str, Subject]] = {
                 "message), one mosquitto and one collector.",
                 by_hand="python -m tests.bench.fleet_load --gateways 1000", problems="lost samples and open ledgers",
             ),
+            Run(
+                "fleet_collectors", "Several collectors",
+                "Three processes `imud fleet collect --shares 3` write to one PostgreSQL database. SIGKILL ends one of "
+                "them every 20 s. This process starts again after 10 s. The time without a collector is the time from "
+                "SIGKILL until another collector acknowledges a message of the same share.",
+                by_hand="python -m tests.bench.fleet_collectors",
+                problems="repeated or missing rows, open ledgers, and shares without a collector",
+            ),
         ),
     ),
     "security": Subject(

@@ -42,7 +42,7 @@ class PostgresServer:
         """Create the data folder. `libraries` is the value of `shared_preload_libraries`. `options` are further options
         of the command `postgres`."""
         self.url = f"postgresql:///postgres?host={folder}&user=imud"
-        self._folder = folder
+        self.folder = folder
         self._libraries, self._options = libraries, options
         self._runs = False
         root = os.geteuid() == 0
@@ -54,10 +54,10 @@ class PostgresServer:
     def start(self) -> None:
         """Start the server and wait for a reply. After `kill`, it recovers from its log."""
         options = (
-            f"-k {self._folder} -c listen_addresses='' -c fsync=off -c shared_preload_libraries='{self._libraries}' "
+            f"-k {self.folder} -c listen_addresses='' -c fsync=off -c shared_preload_libraries='{self._libraries}' "
             + self._options
         )
-        self._call("pg_ctl", "-l", str(self._folder / "log"), "-w", "-t", str(LIMIT_S), "-o", options, "start")
+        self._call("pg_ctl", "-l", str(self.folder / "log"), "-w", "-t", str(LIMIT_S), "-o", options, "start")
         self._runs = True
 
     def kill(self) -> None:
@@ -69,7 +69,7 @@ class PostgresServer:
     def _call(self, program: str, *words: str) -> None:
         assert BIN is not None
         done = subprocess.run(
-            [*self._before, str(BIN / program), "-D", str(self._folder / "data"), *words], cwd=self._folder,
+            [*self._before, str(BIN / program), "-D", str(self.folder / "data"), *words], cwd=self.folder,
             capture_output=True, text=True, timeout=LIMIT_S, check=False,
         )  # fmt: skip
         assert done.returncode == 0, done.stdout + done.stderr

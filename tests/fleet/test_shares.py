@@ -1,16 +1,27 @@
 """Shares: the division among collectors, locks in a real PostgreSQL, and collectors that a test kills."""
 
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+import asyncio
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, closing, contextmanager, suppress
+from pathlib import Path
 
 import pytest
 
+from imud.fleet import reader as fleet_reader
 from imud.fleet import shares
-from imud.fleet.collector import EVERYTHING, Selection
-from imud.fleet.shares import Changes, LockView, ShareLocks, changes
+from imud.fleet.collector import EVERYTHING, FleetCollector, Selection
+from imud.fleet.database.settings import CollectorSettings
+from imud.fleet.reader import Fleet
+from imud.fleet.shares import Changes, FleetShares, LockView, ShareLocks, changes
 from imud.model.errors import BadArgument, ServerError
+from tests.bench.fleet_collectors import play, problems_of
+from tests.fleet.database.deliveries import query
+from tests.fleet.fleet_gateway import SendingGateway, samples_message
+from tests.fleet.mosquitto import NO_MOSQUITTO, Mosquitto
 from tests.fleet.postgres_server import NO_POSTGRES, PostgresServer, running_server
-from tests.support.daemon_process import wait_until
+from tests.fleet.test_connection import until
+from tests.support.daemon_process import LIMIT_S, wait_until
+from tests.support.event_loops import in_loop
 
 
 def divided(total: int, *collectors: set[int], turns: int = 10) -> list[set[int]]:
@@ -55,6 +66,12 @@ def server() -> Iterator[PostgresServer]:
         yield made
 
 
+@pytest.fixture
+def database(server: PostgresServer) -> str:
+    query(server.url, "DROP SCHEMA public CASCADE; CREATE SCHEMA public")
+    return server.url
+
+
 @contextmanager
 def locks(url: str, name: str, selection: Selection = EVERYTHING) -> Iterator[ShareLocks]:
     with closing(ShareLocks(url, name, selection)) as made:
@@ -97,3 +114,133 @@ def test_a_collector_that_stops_loses_its_shares(server: PostgresServer, monkeyp
             wait_until(lambda: other.take(0), "PostgreSQL has released the locks of the stopped collector")
             with pytest.raises(ServerError, match="PostgreSQL"):
                 stopped.view()
+
+
+@live
+def test_rows_are_exactly_once_while_collectors_are_killed(
+    tmp_path: Path, server: PostgresServer, database: str
+) -> None:
+    if NO_MOSQUITTO:
+        pytest.skip(NO_MOSQUITTO)
+    assert problems_of(play(tmp_path, server, gateways=4, seconds=10.0, interval_s=3.0), LIMIT_S) == []
+
+
+@asynccontextmanager
+async def collecting(broker: Mosquitto, url: str, total: int = 1) -> AsyncIterator[FleetShares]:
+    """Run a collector until the end of the block."""
+    fleet = Fleet(f"mqtt://127.0.0.1:{broker.port}", name="shared", retry_max_s=1.0)
+    collector = FleetShares(fleet, url, CollectorSettings(shares=total), EVERYTHING)
+    running = asyncio.ensure_future(collector.run())
+    try:
+        yield collector
+    finally:
+        collector.stop()
+        await running
+
+
+async def until_stored(url: str, last: int) -> None:
+    """Wait until the numbers 1 to `last` are in the database. Each number is there once."""
+
+    async def numbers() -> list[int]:
+        found = await asyncio.to_thread(query, url, "SELECT seq FROM imud_samples ORDER BY seq")
+        return [seq for (seq,) in found]
+
+    found: list[int] = []
+    with suppress(TimeoutError):
+        async with asyncio.timeout(LIMIT_S):
+            while (found := await numbers()) != list(range(1, last + 1)):
+                await asyncio.sleep(0.05)
+    assert found == list(range(1, last + 1))
+
+
+async def send(gateway: SendingGateway, first: int, last: int) -> None:
+    """Send one message for each number, with QoS 1."""
+    await asyncio.to_thread(gateway.send, *(samples_message(seq, seq) for seq in range(first, last + 1)))
+
+
+def subscribed(broker: Mosquitto) -> int:
+    """Return the number of sessions with a subscription."""
+    return len({line.split()[-1] for line in broker.log if "Received SUBSCRIBE from imud-reader-shared" in line})
+
+
+@pytest.fixture
+def short_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shares, "TURN_S", 0.1)
+
+
+@live
+@pytest.mark.usefixtures("short_turns")
+@in_loop
+async def test_a_standby_continues_with_the_sessions(database: str, broker: Mosquitto, gateway: SendingGateway) -> None:
+    async with collecting(broker, database, 2) as standby:
+        await until(lambda: standby.held == {0, 1})
+        async with collecting(broker, database, 2) as other:
+            await until(lambda: standby.held == {0} and other.held == {1} and subscribed(broker) == 2)
+            await send(gateway, 1, 20)
+            await until_stored(database, 20)
+            assert standby.live == 2
+        await send(gateway, 21, 40)
+        await until(lambda: standby.held == {0, 1})
+        await until_stored(database, 40)
+    assert standby.held == frozenset()
+    assert "streams: 1, missing: 0, dropped: 0" in standby.ledger_text()
+
+
+@live
+@pytest.mark.usefixtures("short_turns")
+@in_loop
+async def test_a_lost_database_connection_does_not_end_a_collector(
+    database: str, broker: Mosquitto, gateway: SendingGateway
+) -> None:
+    cut = "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE application_name = 'imud fleet collect'"
+    async with collecting(broker, database, 2) as collector:
+        await until(lambda: collector.held == {0, 1} and subscribed(broker) == 2)
+        await asyncio.to_thread(query, database, cut)
+        await send(gateway, 1, 20)
+        await until(lambda: not collector.held)
+        await until_stored(database, 20)
+        await until(lambda: collector.held == {0, 1})
+
+
+@live
+@pytest.mark.usefixtures("short_turns")
+@in_loop
+async def test_a_share_that_fails_does_not_end_the_others(
+    database: str, broker: Mosquitto, gateway: SendingGateway, monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(shares, "RETRY_S", 0.5)
+    working, failures = FleetCollector.run, [OSError("full"), ServerError("locked"), RuntimeError("wrong")]
+
+    async def run(collector: FleetCollector) -> None:
+        if collector.session.share.number == 1 and failures:
+            raise failures.pop()
+        await working(collector)
+
+    monkeypatch.setattr(FleetCollector, "run", run)
+    async with collecting(broker, database, 2) as collector:
+        await until(lambda: not failures and subscribed(broker) == 2)
+        await send(gateway, 1, 20)
+        await until_stored(database, 20)
+        assert collector.held == {0, 1}
+    for problem in ("share 1: wrong", "share 1: locked", "share 1: full"):
+        assert problem in caplog.text
+    assert caplog.text.count("Traceback") == 1, "only the unknown error has a traceback"
+
+
+@live
+@pytest.mark.usefixtures("short_turns")
+@in_loop
+async def test_sessions_of_an_earlier_number_of_shares_are_emptied(
+    database: str, broker: Mosquitto, gateway: SendingGateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fleet_reader, "DRAIN_S", 0.5)
+    async with collecting(broker, database, 3) as three:
+        await until(lambda: three.held == {0, 1, 2} and subscribed(broker) == 3)
+    await send(gateway, 1, 30)
+    async with collecting(broker, database, 1):
+        await until_stored(database, 30)
+        # after the sessions 1 and 2, the collector finds no session 3
+        await until(lambda: any("imud-reader-shared.3" in line and "disconnected" in line for line in broker.log))
+        await send(gateway, 31, 60)
+        await until_stored(database, 60)

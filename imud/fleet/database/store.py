@@ -259,7 +259,7 @@ class PostgresStore:
             with self._connection.cursor() as cursor:
                 self._upkeep.run(cursor)
         except self._error as error:
-            raise ServerError(f"PostgreSQL: {_sentence(error)}") from error
+            raise ServerError(f"PostgreSQL: {sentence_of(error)}") from error
 
 
 def _decoded(
