@@ -11,8 +11,7 @@ from typing import Final
 from msgspec import to_builtins
 
 from imud.formats.jsonrpc import encode_request, parse_object
-from imud.publishers.metrics.publisher import encoder_for
-from imud.publishers.metrics.scrape_server import REQUEST_BYTES_MAX, parse_request
+from imud.host.scrape_server import REQUEST_BYTES_MAX, encoder_for, parse_request
 from imud.web.guard import WebGuard, host_name, is_address
 from imud.web.messages import CallRequest, LoginRequest, Look, decode_body
 from tests.fuzz.target import Target

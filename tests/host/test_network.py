@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from imud.host.network import listen, resolve
+from imud.host.scrape_server import HttpRequest, HttpResponse, ScrapeServer
 from imud.model.errors import ServerError
-from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer
 from imud.publishers.nmea0183 import TcpOutput, UdpOutput
 from imud.utc.receivers import GpsdSource, RmcOptions
 from tests.support.daemon_process import LIMIT_S

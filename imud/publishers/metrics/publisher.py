@@ -23,13 +23,13 @@ from typing import Annotated, Final
 import msgspec
 from prometheus_client import CollectorRegistry, ProcessCollector
 from prometheus_client.core import Metric
-from prometheus_client.exposition import choose_encoder
 from prometheus_client.registry import Collector
 from prometheus_client.samples import Sample as Line
 
 from imud.contracts.publisher import PublisherContext, PublisherType
 from imud.contracts.status import ClientStatus, DeviceStatus
 from imud.host.log import messages_dropped
+from imud.host.scrape_server import HttpRequest, HttpResponse, ScrapeServer, encoder_for
 from imud.model.event import Event
 from imud.model.options import Options, is_ip_address, shown
 from imud.model.units import NS_PER_S
@@ -44,7 +44,6 @@ from imud.publishers.metrics.families import (
 )
 from imud.publishers.metrics.metric import Snapshot
 from imud.publishers.metrics.rings import RingReader
-from imud.publishers.metrics.scrape_server import HttpRequest, HttpResponse, ScrapeServer
 
 log = logging.getLogger(__name__)
 
@@ -168,15 +167,6 @@ class Renderer:
         self._collector.show(snapshot)
         encode, content_type = encoder_for(accept)
         return HttpResponse("200 OK", encode(self._registry), content_type)
-
-
-def encoder_for(accept: str) -> tuple[Callable[[CollectorRegistry], bytes], str]:
-    """Return the encoder and the content type for an Accept header; the defaults if the header is invalid.
-    `choose_encoder` of prometheus_client raises if `version` is not a number (seen with 0.26)."""
-    try:
-        return choose_encoder(accept)
-    except (TypeError, ValueError):
-        return choose_encoder("")
 
 
 class MetricsPublisher:

@@ -17,6 +17,9 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Final
 
+from prometheus_client import CollectorRegistry
+from prometheus_client.exposition import choose_encoder
+
 from imud.host.network import listen
 from imud.host.threads import share_interpreter
 from imud.model.errors import ServerError
@@ -65,12 +68,15 @@ class ScrapeServer:
         *,
         connection_s: float = CONNECTION_S,
         connections_max: int = CONNECTIONS_MAX,
+        keys: tuple[str, str] = ("metrics.address", "metrics.port"),
     ) -> None:
+        """`keys`: configuration keys or options of address and port, for error messages."""
         self.address = address
         self.port = port  # bound port after the start, also if the configured port is 0
         self._answer: Answer = _no_answer
         self._connection_s = connection_s
         self._connections_max = connections_max
+        self._keys = keys
         self._connections: dict[asyncio.Task[None], None] = {}
         self._listener: socket.socket | None = None
         self._thread: threading.Thread | None = None
@@ -91,7 +97,7 @@ class ScrapeServer:
         try:
             self._listener = listen(self.address, self.port)
         except OSError as error:
-            raise ServerError(_bind_message(self.address, self.port, error)) from error
+            raise ServerError(self._bind_message(error)) from error
         self.port = self._listener.getsockname()[1]
         ready = threading.Event()
         self._thread = threading.Thread(target=self._run, args=(self._listener, ready), name="scrape", daemon=True)
@@ -110,6 +116,15 @@ class ScrapeServer:
         if self._listener:
             self._listener.close()
         self._thread = self._listener = None
+
+    def _bind_message(self, error: OSError) -> str:
+        address_key, port_key = self._keys
+        hint = f"set {address_key} to an address of the host, for example 127.0.0.1 or 0.0.0.0"
+        if error.errno == errno.EADDRINUSE:
+            hint = f"another program uses this port (`ss -ltnp 'sport = {self.port}'`); stop it, or set {port_key}"
+        elif error.errno == errno.EACCES:
+            hint = f"ports below 1024 need CAP_NET_BIND_SERVICE; set {port_key} to a higher port"
+        return f"cannot serve metrics at {self.address} port {self.port}: {error.strerror}; {hint}"
 
     def _run(self, listener: socket.socket, ready: threading.Event) -> None:
         try:
@@ -199,10 +214,10 @@ def _response(answer: HttpResponse, *, with_body: bool) -> bytes:
     return head.encode("latin-1") + (answer.body if with_body else b"")
 
 
-def _bind_message(address: str, port: int, error: OSError) -> str:
-    hint = "set metrics.address to an address of the host, for example 127.0.0.1 or 0.0.0.0"
-    if error.errno == errno.EADDRINUSE:
-        hint = f"another program uses this port (`ss -ltnp 'sport = {port}'`); stop it, or set metrics.port"
-    elif error.errno == errno.EACCES:
-        hint = "ports below 1024 need CAP_NET_BIND_SERVICE; set metrics.port to a higher port"
-    return f"cannot serve metrics at {address} port {port}: {error.strerror}; {hint}"
+def encoder_for(accept: str) -> tuple[Callable[[CollectorRegistry], bytes], str]:
+    """Return the encoder and the content type for an Accept header; the defaults if the header is invalid.
+    `choose_encoder` of prometheus_client raises if `version` is not a number (seen with 0.26)."""
+    try:
+        return choose_encoder(accept)
+    except (TypeError, ValueError):
+        return choose_encoder("")

@@ -12,8 +12,8 @@ from unittest.mock import Mock, call
 
 import pytest
 
+from imud.host.scrape_server import Answer, HttpRequest, HttpResponse, ScrapeServer, parse_request
 from imud.model.errors import ServerError
-from imud.publishers.metrics.scrape_server import Answer, HttpRequest, HttpResponse, ScrapeServer, parse_request
 from tests.support.event_loops import in_loop
 from tests.support.metrics import LIMIT_S, ask, read_all
 
