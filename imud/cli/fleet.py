@@ -13,6 +13,7 @@ from typing import Final, Protocol
 import msgspec
 
 from imud.cli.arguments import CliCommand, add_duration
+from imud.cli.fleet_status import DATABASE_ACTIONS, add_rejected, add_status
 from imud.cli.output import complain, table
 from imud.config import load_options
 from imud.fleet.accounts import GatewayState, StreamAccount, StreamKey
@@ -260,6 +261,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     collecting.add_argument(
         "--config", metavar="FILE", help="for a postgresql URL: settings of the collector and its database (YAML)"
     )
+    add_status(actions.add_parser("status", help="show the state of all gateways in the database, and a summary"))
+    add_rejected(actions.add_parser("rejected", help="show the messages that the collector could not store"))
     showing = actions.add_parser("top", help="show all gateways in a full-screen view of the terminal")
     _broker(showing)
     add_top(showing)
@@ -288,7 +291,9 @@ def _broker(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run `collect` or `top`. Raises ImudError."""
+    """Run the action. Raises ImudError."""
+    if args.action in DATABASE_ACTIONS:
+        return DATABASE_ACTIONS[args.action](args)
     if args.action == "top":
         return asyncio.run(run_top(args, fleet_of(args, "", from_begin=False)))
     return asyncio.run(_collect(args))
