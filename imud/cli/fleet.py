@@ -6,7 +6,7 @@ import signal
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from time import monotonic_ns, time_ns
 from typing import Final, Protocol
 
@@ -22,6 +22,7 @@ from imud.fleet.collector import GC_ALLOCATIONS, FleetCollector, JsonLines, Ledg
 from imud.fleet.database.settings import CollectorSettings
 from imud.fleet.influx import InfluxStore
 from imud.fleet.messages import GatewayClock, Stream
+from imud.fleet.metrics_server import CollectorMetricsServer, FleetGauges
 from imud.fleet.reader import SHARES_MAX, VERSIONS, Fleet, FleetBatch
 from imud.fleet.shares import FleetShares
 from imud.host.http_post import HttpPost, PostAccess, post_url
@@ -259,6 +260,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "same command on several hosts, and each collector takes its part",
     )  # fmt: skip
     collecting.add_argument(
+        "--metrics", metavar="HOST:PORT",
+        help="for a postgresql URL: serve Prometheus metrics at http://HOST:PORT/metrics, for example 127.0.0.1:9322",
+    )  # fmt: skip
+    collecting.add_argument(
         "--config", metavar="FILE", help="for a postgresql URL: settings of the collector and its database (YAML)"
     )
     add_status(actions.add_parser("status", help="show the state of all gateways in the database, and a summary"))
@@ -313,15 +318,22 @@ async def _collect(args: argparse.Namespace) -> int:
     fleet = fleet_of(args, args.name, from_begin=args.from_begin)
     selection = Selection(args.site, args.gateway, args.device)
     is_postgres = args.to.startswith(("postgresql://", "postgres://"))
-    if not is_postgres and not (args.config is None and args.shares is None):
-        raise BadArgument("--config, --shares: expected --to with a postgresql URL")
+    if not is_postgres and not (args.config is None and args.shares is None and args.metrics is None):
+        raise BadArgument("--config, --shares, --metrics: expected --to with a postgresql URL")
     store = None if is_postgres else store_of(args, fleet)
-    try:
-        collector = (
-            FleetShares(fleet, args.to, settings_of(args), selection, from_begin=args.from_begin)
-            if store is None
-            else FleetCollector(fleet, store, selection)
-        )
+    with ExitStack() as stack:
+        collector: FleetShares | FleetCollector
+        if store is None:
+            settings = settings_of(args)
+            collector = FleetShares(fleet, args.to, settings, selection, from_begin=args.from_begin)
+            if settings.metrics:
+                gauges = FleetGauges(args.to, settings.silent_s, monotonic_ns)
+                server = CollectorMetricsServer(settings.metrics, collector.status, gauges)
+                stack.enter_context(closing(server))
+                server.start()
+        else:
+            stack.enter_context(closing(store))
+            collector = FleetCollector(fleet, store, selection)
         for number in (signal.SIGINT, signal.SIGTERM):
             asyncio.get_running_loop().add_signal_handler(number, collector.stop)
         # collections would take a large share of the CPU time at high rates
@@ -329,9 +341,6 @@ async def _collect(args: argparse.Namespace) -> int:
             await collector.run(stop_after_s=args.duration)
         for line in _results(fleet, collector, store):
             print(line, file=sys.stderr)
-    finally:
-        if store is not None:
-            store.close()
     if fleet.ignored:
         print(f"{fleet.ignored} messages were invalid and not stored; the log names them", file=sys.stderr)
     if fleet.problem:
@@ -355,13 +364,13 @@ def _results(fleet: Fleet, collector: FleetShares | FleetCollector, store: Ledge
 
 
 def settings_of(args: argparse.Namespace) -> CollectorSettings:
-    """Return the settings of --config and --shares. Raises BadArgument, ConfigError."""
+    """Return the settings of --config, --shares and --metrics. Raises BadArgument, ConfigError."""
     settings = CollectorSettings() if args.config is None else load_options(args.config, CollectorSettings)
-    if args.shares is None:
-        return settings
-    if not 1 <= args.shares <= SHARES_MAX:
-        raise BadArgument(f"--shares: expected 1 to {SHARES_MAX}, got {args.shares}")
-    return msgspec.structs.replace(settings, shares=args.shares)
+    shares = settings.shares if args.shares is None else args.shares
+    if not 1 <= shares <= SHARES_MAX:
+        raise BadArgument(f"--shares: expected 1 to {SHARES_MAX}, got {shares}")
+    metrics = settings.metrics if args.metrics is None else args.metrics
+    return msgspec.structs.replace(settings, shares=shares, metrics=metrics)
 
 
 def store_of(args: argparse.Namespace, fleet: Fleet) -> LedgerStore:

@@ -9,7 +9,9 @@ The broker sends messages without an acknowledgement to the next collector.
 """
 
 import asyncio
+from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
+from threading import Lock
 from typing import Final, NamedTuple, Protocol, TextIO
 
 import msgspec
@@ -92,16 +94,40 @@ def session_of(fleet: Fleet, selection: Selection, share: Share) -> FleetSession
     return FleetSession(fleet, site=site, gateway=gateway, device=device, share=share)
 
 
+class TransactionTimes:
+    """Histogram of the durations of transactions. Synchronization: none required."""
+
+    BOUNDS_S: Final = (0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)  # upper bounds of the buckets, s
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._counts = [0] * (len(self.BOUNDS_S) + 1)
+        self._sum_s = 0.0
+
+    def add(self, seconds: float) -> None:
+        """Count a completed transaction with its duration, s."""
+        with self._lock:
+            self._counts[bisect_left(self.BOUNDS_S, seconds)] += 1
+            self._sum_s += seconds
+
+    def read(self) -> tuple[list[int], float]:
+        """Return the number of transactions in each bucket, and the sum of the durations, s."""
+        with self._lock:
+            return list(self._counts), self._sum_s
+
+
 class FleetCollector:
     """One run of the collector. Synchronization: one event loop, also for `stop`."""
 
     def __init__(
         self, fleet: Fleet, store: FleetStore, selection: Selection = EVERYTHING, share: Share = WHOLE,
+        times: TransactionTimes | None = None,
     ) -> None:  # fmt: skip
-        """Raises BadArgument if a name of the selection or the share is invalid."""
+        """`times` receives the durations of transactions. Raises BadArgument if a name of the selection or the share
+        is invalid."""
         self.session = session_of(fleet, selection, share)
         self.is_drained = False  # True after `run` of a surplus share that received all waiting messages
-        self._store, self._now_ns = store, fleet.now_ns
+        self._store, self._now_ns, self._times = store, fleet.now_ns, times or TransactionTimes()
         self._stopped = False
 
     def stop(self) -> None:
@@ -142,7 +168,10 @@ class FleetCollector:
 
     async def _write(self, session: FleetSession, turn: Sequence[FleetDelivery]) -> None:
         """Store the messages of a turn and acknowledge them."""
+        begin_ns = self._now_ns()
         await asyncio.to_thread(self._store.write, turn)
+        if turn:
+            self._times.add((self._now_ns() - begin_ns) / NS_PER_S)
         for delivery in turn:
             session.acknowledge(delivery)
 

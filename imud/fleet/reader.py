@@ -310,6 +310,16 @@ class FleetSession:
             self._newest_ns = self._fleet.now_ns()
 
     @property
+    def is_connected(self) -> bool:
+        return self._connection is not None
+
+    @property
+    def waiting(self) -> int:
+        """Return the number of received messages without an acknowledgement."""
+        connection = self._connection
+        return 0 if connection is None else self._open + connection.waiting
+
+    @property
     def is_drained(self) -> bool:
         """Return whether the session of a surplus share is empty."""
         if self._connection is None or not self.share.is_surplus:

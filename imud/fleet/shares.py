@@ -17,7 +17,7 @@ from contextlib import closing, suppress
 from hashlib import blake2s
 from typing import Any, Final, NamedTuple
 
-from imud.fleet.collector import FleetCollector, Selection, session_of
+from imud.fleet.collector import FleetCollector, Selection, TransactionTimes, session_of
 from imud.fleet.database.settings import CollectorSettings
 from imud.fleet.database.store import PostgresStore, connected, sentence_of
 from imud.fleet.database.transaction import StoreCounts
@@ -144,6 +144,18 @@ def changes(total: int, view: LockView, own: Collection[int], paused: Collection
     return Changes(tuple(free[: max(0, most - len(own))]), tuple(sorted(own)[most:]))
 
 
+class CollectorStatus(NamedTuple):
+    """State of this process and counters since its start."""
+
+    counts: StoreCounts
+    transactions: tuple[list[int], float]  # as `TransactionTimes.read`
+    waiting: int  # received messages without an acknowledgement
+    shares: int  # shares that this process holds
+    free_shares: int | None  # shares that no collector holds; None without a connection to the database
+    broker_connected: bool  # False if a share of this process has no connection to a broker
+    database_connected: bool
+
+
 class _ShareRun:
     """Collector of one share. Synchronization: one event loop."""
 
@@ -174,7 +186,6 @@ class FleetShares:
         """`url` is the database. Raises BadArgument if a name of the selection is invalid, or if MQTT 3.1.1 cannot
         divide the messages."""
         self.live = 1  # number of running collectors with the same name
-        self.counts = StoreCounts()  # of all shares since the start
         self._fleet, self._url, self._settings, self._selection = fleet, url, settings, selection
         self._from_begin = from_begin
         self._total = settings.shares
@@ -182,6 +193,9 @@ class FleetShares:
         self._locks = ShareLocks(url, fleet.name, selection)
         self._runs: dict[int, _ShareRun] = {}
         self._tasks: dict[int, asyncio.Task[None]] = {}  # tasks of the runs
+        self._counts: dict[int, StoreCounts] = {}  # counters of each share since the start
+        self._times = TransactionTimes()
+        self._free: int | None = None  # number of shares that no collector holds
         self._paused_ns: dict[int, int] = {}  # time until which this collector does not take a share again
         # Next surplus share to check; None after the last. MQTT 3.1.1 has no shares.
         self._surplus = self._total if fleet.is_v5 else None
@@ -193,6 +207,24 @@ class FleetShares:
     def held(self) -> frozenset[int]:
         """Return the numbers of the shares that this collector holds."""
         return frozenset(self._locks.own)
+
+    @property
+    def counts(self) -> StoreCounts:
+        """Return the counters of all shares since the start."""
+        total = StoreCounts()
+        for one in list(self._counts.values()):
+            total.add(one)
+        return total
+
+    def status(self) -> CollectorStatus:
+        """Return the state of this process. Any thread may call this function."""
+        runs = list(self._runs.values())
+        sessions = [run.collector.session for run in runs if run.collector is not None]
+        return CollectorStatus(
+            self.counts, self._times.read(), sum(one.waiting for one in sessions), len(self._locks.own), self._free,
+            broker_connected=sum(one.is_connected for one in sessions) == len(runs),
+            database_connected=self._locks.is_connected,
+        )  # fmt: skip
 
     def stop(self) -> None:
         """End after the present transactions. `run` stores the received messages first."""
@@ -240,6 +272,7 @@ class FleetShares:
             if self._problem != str(error):
                 log.warning("%s; this collector has no share until the database is available", error)
             self._problem = str(error)
+            self._free = None
             self._stop_runs()
             await asyncio.to_thread(self._locks.close)
 
@@ -257,6 +290,7 @@ class FleetShares:
         for number in (*todo.take, *surplus):
             if number not in self._locks.own and await asyncio.to_thread(self._locks.take, number):
                 self._start(Share(number, self._total))
+        self._free = sum(number not in view.held | self._locks.own for number in range(self._total))
         if self.live != view.live or todo != Changes():
             self.live = view.live
             names = ", ".join(map(str, sorted(self._locks.own))) or "none"
@@ -296,10 +330,10 @@ class FleetShares:
     async def _collect(self, run: _ShareRun) -> None:
         """Collect the messages of a share. Raises ServerError or OSError if the store fails."""
         store = await asyncio.to_thread(PostgresStore, self._url, self._settings, from_begin=self._from_begin)
+        store.counts = self._counts.setdefault(run.share.number, store.counts)
         try:
-            collector = FleetCollector(self._fleet, store, self._selection, run.share)
+            collector = FleetCollector(self._fleet, store, self._selection, run.share, self._times)
             run.begin(collector)
             await collector.run()
         finally:
-            self.counts.add(store.counts)
             await asyncio.to_thread(store.close)

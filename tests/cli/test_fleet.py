@@ -77,7 +77,9 @@ def test_arguments_are_checked(cli: Cli) -> None:
         (["collect", "mqtt://host", "--to", "elsewhere"], "--to: expected"),
         (["collect", "mqtt://host", "--to", "postgresql://127.0.0.1:1/a"], "PostgreSQL: "),
         (["collect", "mqtt://host", "--to", "postgres://127.0.0.1:1/a"], "PostgreSQL: "),
-        (["collect", "mqtt://host", "--to", "-", "--shares", "2"], "--config, --shares: expected --to with a postgres"),
+        (["collect", "mqtt://host", "--to", "-", "--shares", "2"], "--config, --shares, --metrics: expected --to"),
+        (["collect", "mqtt://host", "--to", "-", "--metrics", "127.0.0.1:0"], "--metrics: expected --to with a post"),
+        (["collect", "mqtt://host", "--to", "postgresql:///a", "--metrics", "x"], "metrics: expected HOST:PORT"),
         (["collect", "mqtt://host", "--to", "postgresql:///a", "--shares", "65"], "--shares: expected 1 to 64, got 65"),
         (
             ["collect", "mqtt://host", "--to", "postgresql:///a", "--shares", "2", "--mqtt-version", "3.1.1"],

@@ -1,17 +1,26 @@
 """`imud fleet status` and `imud fleet rejected` on a real database: tables, summary, JSON, exit statuses, payloads."""
 
 import json
+import signal
 import subprocess
 import sys
+import urllib.request
 from collections.abc import Iterator
+from contextlib import suppress
 
 import pytest
+from prometheus_client.parser import text_string_to_metric_families
 
 from imud.cli.fleet_status import ROWS_MAX, STATUS_HEAD, rejected_page
 from imud.fleet.database.overview import RejectedCounts
-from tests.cli.conftest import Cli, Terminal
+from imud.fleet.metrics import PREFIX
+from tests.cli.conftest import Cli, Terminal, imud_process
 from tests.fleet.database.gateway_rows import add_gateways, add_rejected, make_tables, query
+from tests.fleet.fleet_gateway import SendingGateway, samples_message
+from tests.fleet.mosquitto import Mosquitto
 from tests.fleet.postgres_server import NO_POSTGRES, running_postgres
+from tests.support.daemon_process import LIMIT_S, wait_until
+from tests.support.surroundings import free_port
 
 needs_postgres = pytest.mark.skipif(bool(NO_POSTGRES), reason=NO_POSTGRES)
 
@@ -100,6 +109,36 @@ def test_rejected_prints_messages_and_payloads(database: str, cli: Cli, monkeypa
     cli("fleet", "rejected", database, "--payload", 1)
     assert terminal.getvalue().startswith(r"\x1b[31m\udcff\nxxx")
     assert terminal.getvalue().isascii()
+
+
+@needs_postgres
+@pytest.mark.live
+def test_a_collector_serves_metrics_and_status_counts_it(database: str, broker: Mosquitto, cli: Cli) -> None:
+    port, gateway = free_port(), SendingGateway(broker.port)
+    words = ("fleet", "collect", f"mqtt://127.0.0.1:{broker.port}", "--to", database, "--metrics", f"127.0.0.1:{port}")
+
+    def values() -> dict[str, float]:
+        with suppress(OSError), urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=LIMIT_S) as answer:
+            families = text_string_to_metric_families(answer.read().decode())
+            return {one.name.removeprefix(PREFIX): one.value for family in families for one in family.samples}
+        return {}
+
+    with imud_process(*words) as process:
+        connected = {"shares": 1, "broker_connected": 1}
+        wait_until(lambda: values().items() >= connected.items(), "the share has a session")
+        gateway.send(samples_message(1, 10), samples_message(8, 12))
+        gateway.publish([("imud/mill/gw/bow/samples", b"garbage")])
+        stored = {"messages_total": 2, "rejected_total": 1, "waiting_messages": 0}
+        wait_until(lambda: values().items() >= stored.items(), "all messages are stored")
+        found = values()
+        assert (found["rows_total"], found["duplicates_total"]) == (12, 3)
+        assert (found["free_shares"], found["database_connected"]) == (0, 1)
+        assert 1 <= found["transaction_seconds_count"] <= 3
+        assert "imud/mill/gw/bow/samples  expected a message" in cli("fleet", "rejected", database).out
+        assert "collectors  1 running, with 1 shares" in cli("fleet", "status", database).out
+        process.end(signal.SIGTERM)
+    gateway.close()
+    assert "collectors  0 running, with 0 shares" in cli("fleet", "status", database).out
 
 
 def test_frequent_reasons_are_shown_and_the_others_are_counted() -> None:

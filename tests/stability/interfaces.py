@@ -26,6 +26,7 @@ from imud.cli.arguments import CliCommand
 from imud.cli.doctor import command as doctor
 from imud.cli.doctor.surroundings import DoctorFinding
 from imud.cli.events import PrintedEvent
+from imud.cli.fleet_status import FleetReport, RejectedReport
 from imud.cli.modbus import FoundModule
 from imud.cli.probe import ProbeReport
 from imud.cli.run import EXIT_CONFIGURATION, EXIT_INTERNAL, EXIT_OUTPUT
@@ -41,6 +42,7 @@ from imud.fleet.accounts import GatewayState
 from imud.fleet.database.settings import CollectorSettings
 from imud.fleet.database.tables import SCHEMA_VERSION, TABLES, Column
 from imud.fleet.database.views import views as database_views
+from imud.fleet.metrics import COLLECTOR_METRICS, FLEET_METRICS
 from imud.formats import jsonrpc, recording, records, ring, slot
 from imud.formats.influx import event_fields, measure_fields, sample_fields
 from imud.model.errors import ConfigError, ImudError
@@ -208,6 +210,8 @@ JSON_OF: Final[Mapping[str, type]] = {
     "imud doctor --json: checks.findings": DoctorFinding,
     "imud events --json": PrintedEvent,
     "imud firmware --json": FirmwareResult,
+    "imud fleet rejected --json": RejectedReport,
+    "imud fleet status --json": FleetReport,
     "imud modbus scan --json": FoundModule,
     "imud probe --json": ProbeReport,
     "imud settings --json": SettingsReport,
@@ -326,6 +330,8 @@ def metrics() -> Facts:
             elif isinstance(one, Histogram):
                 bounds = " ".join(map(str, one.bounds_ns))
                 found[one.name] = f"histogram, labels device, bounds {bounds} ns"
+    for metric in (*COLLECTOR_METRICS, *FLEET_METRICS):
+        found[metric.name] = f"{metric.type.value}, labels {', '.join(metric.labels) or 'none'}"
     refused = msgspec.structs.replace(UTC, refused={one.value: 0 for one in Refusal})
     snapshot = Snapshot(
         (equipped("NAME", utc=refused),), (client(1),), tuple((("NAME", kind.value), 1) for kind in EventKind),

@@ -16,15 +16,14 @@ from typing import Any, Final, NamedTuple, Self
 import msgspec
 
 from imud.fleet.database.settings import CollectorSettings
+from imud.fleet.database.store import APPLICATION, connected, sentence_of
 from imud.fleet.database.views import GATEWAY_STATUS
+from imud.fleet.shares import PRESENCE
 from imud.host.installation import needs_extra
 from imud.model.errors import BadArgument, ServerError
 
-CONNECT_S: Final = 10  # maximum time of the connection, s
 STATEMENT_S: Final = 60  # maximum time of a statement, s; 10,000 gateways with 30 streams need less than 1 s
 REASONS_MAX: Final = 20  # maximum number of reasons in `RejectedCounts`
-PRESENCE: Final = 1 << 30
-APPLICATION: Final = "imud fleet collect"
 LEAD: Final = 0x696D7564_6C656164  # key of the advisory lock for the metrics of a fleet, "imudlead"
 SILENT_S: Final = CollectorSettings().silent_s
 
@@ -194,14 +193,14 @@ class OverviewReader:
             import psycopg
         self._leads = False
         self._error: type[Exception] = psycopg.Error
-        try:
-            self._connection: Any = psycopg.connect(
-                url, connect_timeout=CONNECT_S, application_name="imud fleet status", autocommit=True
-            )
-            self._connection.execute("SET default_transaction_read_only = on")
-            self._connection.execute(f"SET statement_timeout = {round(statement_s * 1000)}")
-        except psycopg.Error as error:
-            raise ServerError(_problem(error)) from None  # the cause can contain the password of the URL
+        self._connection: Any = connected(url)
+        self._connection.autocommit = True
+        for name, value in (
+            ("application_name", "imud fleet status"),
+            ("default_transaction_read_only", "on"),
+            ("statement_timeout", f"{round(statement_s * 1000)}ms"),
+        ):
+            self._rows("SELECT set_config(%(name)s, %(value)s, false)", {"name": name, "value": value})
 
     def __enter__(self) -> Self:
         return self
@@ -279,7 +278,7 @@ class OverviewReader:
         """Return the rows of a statement. Raises ServerError."""
         try:
             rows: list[Any] = self._connection.execute(statement, values).fetchall()
-        except self._error as error:
+        except (self._error, ValueError) as error:  # ValueError: text in another encoding than UTF-8
             raise ServerError(_problem(error)) from error
         return rows
 
@@ -296,15 +295,12 @@ def _gateway(site: str, gateway: str, state: str, reason: str, version: str, dev
 
 def _problem(error: Any) -> str:
     """Return the message for an error of psycopg, with the next step."""
-    text = " ".join(str(error).split())
-    match error.sqlstate, type(error).__name__:
-        case "42P01", _:  # undefined table
+    text = sentence_of(error)
+    match getattr(error, "sqlstate", None):
+        case "42P01":  # undefined table
             return f"PostgreSQL: {text}; is this the database of `imud fleet collect --to`?"
-        case "42501", _:  # insufficient privilege
+        case "42501":  # insufficient privilege
             return f"PostgreSQL: {text}; grant SELECT on all tables imud_* to this user"
-        case "57014", _:  # statement timeout
+        case "57014":  # statement timeout
             return f"PostgreSQL: {text}; try again, or select a --site"
-        case None, "ProgrammingError":  # libpq quotes the part of the URL that it cannot parse
-            unquoted = text.partition('"')[0].rstrip(": ")
-            return f"PostgreSQL: cannot parse the URL: {unquoted}; imud does not show it because of its password"
     return f"PostgreSQL: {text}"

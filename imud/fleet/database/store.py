@@ -44,6 +44,7 @@ OF_VALUES: Final = ("22", "54")
 OF_CONFLICTS: Final = ("40001", "40P01", "55P03")
 CONFLICTS_MAX: Final = 10  # maximum number of repetitions of a transaction after conflicts
 LOCK_S: Final = 20  # maximum wait for the lock of a row or a table, s
+APPLICATION: Final = "imud fleet collect"  # application_name of the connections of a collector
 CONNECT_S: Final = 10  # maximum time of an attempt to connect, s
 # Number of attempts to connect again, and the pause before each, s. The restart of a server takes some seconds.
 ATTEMPTS: Final = 20
@@ -70,7 +71,7 @@ def connected(url: str) -> Any:
     keep_alive: dict[str, Any] = {f"keepalives_{name}": value for name, value in KEEP_ALIVE.items()}
     try:
         connection = psycopg.connect(
-            url, connect_timeout=CONNECT_S, application_name="imud fleet collect", client_encoding="utf8",
+            url, connect_timeout=CONNECT_S, application_name=APPLICATION, client_encoding="utf8",
             tcp_user_timeout=DEAD_S * 1000, **keep_alive,
         )  # fmt: skip
         # a statement after a lock must see the rows that the transaction before it stored
