@@ -6,7 +6,7 @@
 # make check  ruff, mypy --strict, then the tests                   make bench  measurements, into build/bench.json
 #                                                                   (ARGS=--short: at most 5 minutes)
 # make report  measures and writes docs/measurements (ARGS="latency fleet": these pages; ARGS=--stored: without measuring)
-# make alerts every alert provoked, by a real Prometheus that scrapes a daemon: fires and clears, with a table of times
+# make alerts every alert of a daemon and of a fleet provoked, in a real Prometheus: fires and clears, with a table of times
 # make signalk-deps   installs the Signal K server with npm into build/signalk, for the tests of the output signalk
 # make monitoring-deps   installs Prometheus and Alertmanager, for the tests of rules, examples and dashboard
 # make fleet-deps  installs PostgreSQL, for the tests of the collector, and what make mqtt-deps and make influx-deps install
@@ -101,7 +101,7 @@ mutants: $(VENV)/made
 
 .PHONY: alerts
 alerts: $(VENV)/made
-	IMUD_ALERTS=1 $(BIN)/pytest -s tests/monitoring/test_alerts.py $(ARGS)
+	IMUD_ALERTS=1 $(BIN)/pytest -s tests/monitoring/test_alerts.py tests/monitoring/test_fleet_alerts.py $(ARGS)
 
 # PYTHONS="3.12 3.13" takes only these.
 .PHONY: test-pythons

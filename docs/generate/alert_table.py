@@ -1,18 +1,19 @@
-"""Table of the alerts in docs/monitoring.md, created from the rules (`python -m docs.generate.references`)."""
+"""Tables of alerts in docs/monitoring.md and docs/fleet-operation.md (`python -m docs.generate.references`)."""
 
 import re
+from pathlib import Path
 from typing import Final
 
-from tests.monitoring.prometheus import RULES, alerts_of
+from tests.monitoring.prometheus import alerts_of
 
 PARTS: Final = ("description", "cause", "next_step")
 """Annotations that are columns of the table."""
 
 
-def alert_table() -> str:
-    """Return the table with one row per alert."""
+def alert_table(rules: Path) -> str:
+    """Return the table with one row per alert of a file of rules."""
     rows = ["| alert | severity, after | meaning | likely causes | next step |", "|---|---|---|---|---|"]
-    for alert in alerts_of(RULES.read_text()):
+    for alert in alerts_of(rules.read_text()):
         name, wait = alert["alert"], alert.get("for", "")
         severity = alert["labels"]["severity"] + (f", {wait}" if wait else "")
         cells = [_cell(alert["annotations"][part]) for part in PARTS]

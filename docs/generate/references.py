@@ -7,6 +7,7 @@
 | docs/shm.md | layout of shared memory |
 | docs/monitoring.md | rules for Prometheus |
 | docs/fleet-database.md | tables and views of the fleet database |
+| docs/fleet-operation.md | metrics of the collector (imud/fleet/metrics.py) and rules for Prometheus |
 | docs/stability.md | versions of the interfaces (tests/stability/interfaces.py) |
 | docs/python.md, docs/simulators.md | docstrings and signatures (docs/generate/python_reference.py) |
 | docs/socket.schema.json | messages of the socket (docs/generate/socket_schema.py) |
@@ -41,6 +42,7 @@ from imud.fleet.database.settings import CollectorSettings
 from imud.fleet.database.tables import COMPONENTS, Column
 from imud.fleet.database.tables import TABLES as DATABASE_TABLES
 from imud.fleet.database.views import views
+from imud.fleet.metrics import COLLECTOR_METRICS, FLEET_METRICS, CollectorMetric
 from imud.fleet.settings import DeviceSending
 from imud.fleet.statistics import MEASURES
 from imud.formats.ring import (
@@ -58,6 +60,7 @@ from imud.lines.sync import RESET, TRIGGER
 from imud.model.ledger import LEDGER_FIELDS
 from imud.model.options import Options, expected, shown
 from imud.utc.receivers import RmcOptions
+from tests.monitoring.prometheus import FLEET_RULES, RULES
 from tests.support.files import ROOT
 
 # --- values in cells --------------------------------------------------------------------------------------------------
@@ -459,6 +462,14 @@ def database_parts() -> dict[str, str]:
     }
 
 
+# --- docs/fleet-operation.md ------------------------------------------------------------------------------------------
+
+
+def metrics_table(metrics: Sequence[CollectorMetric]) -> str:
+    rows = [f"| `{one.name}` | {' '.join(f'`{label}`' for label in one.labels)} | {one.help} |" for one in metrics]
+    return "\n".join(["| name | labels | meaning |", "|---|---|---|", *rows])
+
+
 # --- docs/stability.md ------------------------------------------------------------------------------------------------
 
 
@@ -488,8 +499,13 @@ PAGES: Final[Mapping[str, Callable[[], Mapping[str, str]]]] = {
     "docs/calibration.md": lambda: {"calibrations": calibrations_table()},
     "docs/settings.md": lambda: {"settings": "\n" + device_settings_tables()},
     "docs/shm.md": layout_tables,
-    "docs/monitoring.md": lambda: {"alerts": alert_table()},
+    "docs/monitoring.md": lambda: {"alerts": alert_table(RULES)},
     "docs/fleet-database.md": database_parts,
+    "docs/fleet-operation.md": lambda: {
+        "collector": metrics_table(COLLECTOR_METRICS),
+        "fleet": metrics_table(FLEET_METRICS),
+        "alerts": alert_table(FLEET_RULES),
+    },
     "docs/stability.md": lambda: {"versions": versions()},
     "docs/python.md": lambda: {"reference": "\n" + python_reference(imud.client)},
     "docs/simulators.md": lambda: {"devices": simulators_table(), "reference": "\n" + python_reference(imud.sim)},

@@ -19,6 +19,7 @@ from tests.support.files import ROOT
 from tests.support.surroundings import free_port
 
 RULES: Final = ROOT / "etc/prometheus/imud.rules.yml"
+FLEET_RULES: Final = ROOT / "etc/prometheus/imud-fleet.rules.yml"
 LIMIT_S: Final = 120.0
 INTERVAL_MS: Final = 250
 """Time between scrapes and between evaluations of the rules, ms. `Pace` makes it longer if a scrape takes long."""
@@ -116,28 +117,30 @@ class RealPrometheus:
         return result
 
 
-def configuration(folder: Path, interval_ms: int, rules: Sequence[str]) -> str:
-    """Return prometheus.yml with the job imud. Its targets are in a file."""
+def configuration(folder: Path, interval_ms: int, rules: Sequence[str], job: str = "imud") -> str:
+    """Return prometheus.yml with one job. Its targets are in a file."""
     names = ("scrape_interval", "scrape_timeout", "evaluation_interval")
     times = json.dumps(dict.fromkeys(names, f"{interval_ms}ms"))
     return f"""\
 global: {times}
 rule_files: {json.dumps(list(rules))}
 scrape_configs:
-  - job_name: imud
+  - job_name: {job}
     file_sd_configs: [{{files: [{folder}/targets.json], refresh_interval: 1s}}]
 """
 
 
 @contextmanager
-def real_prometheus(folder: Path, rules: str = "", pace: Pace | None = None) -> Iterator[RealPrometheus]:
+def real_prometheus(
+    folder: Path, rules: str = "", pace: Pace | None = None, job: str = "imud"
+) -> Iterator[RealPrometheus]:
     """Run Prometheus in a folder with these rules. It has no targets at first."""
     port = free_port()
     running = RealPrometheus(folder, port)
     running.scrape()
     (folder / "rules.yml").write_text(rules or "groups: []\n")
     file = folder / "prometheus.yml"
-    file.write_text(configuration(folder, (pace or Pace()).interval_ms, [str(folder / "rules.yml")]))
+    file.write_text(configuration(folder, (pace or Pace()).interval_ms, [str(folder / "rules.yml")], job))
     argv = [
         "prometheus", f"--config.file={file}", f"--storage.tsdb.path={folder / 'tsdb'}", "--log.level=warn",
         f"--web.listen-address=127.0.0.1:{port}",
