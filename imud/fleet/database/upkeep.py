@@ -13,7 +13,7 @@ waits at most LOCK_MS for a lock of a table, because collectors wait behind it.
 """
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from itertools import chain
@@ -55,6 +55,10 @@ _TIMESCALE_MIN: Final = (2, 11)
 # Columns that identify the stream of a row; TimescaleDB compresses the rows of one stream together
 _OF_STREAM: Final = ("gateway", "boot", "device", "stream", "utc_set")
 
+_CHOSEN: Final = "IN (SELECT * FROM unnest(%(gateways)s::text[], %(boots)s::text[]))"
+# the second condition uses the index
+_OF_BOOTS: Final = f"(gateway, split_part(boot, '-', 1)) {_CHOSEN} AND gateway = ANY(%(gateways)s)"
+
 
 class _Partition(NamedTuple):
     """Partition, or chunk of a hypertable."""
@@ -73,6 +77,7 @@ class Upkeep:
         self.expired_incomplete = 0  # number of removed boots with missing numbers
         self._settings = settings
         self._reported: set[str] = set()
+        self._old: list[tuple[str, str]] = []  # gateway and boot of the boots that the present run removes
 
     # --- start --------------------------------------------------------------------------------------------------------
 
@@ -80,13 +85,21 @@ class Upkeep:
         """Create missing tables, partitions and views in the transaction of `cursor`. If all tables exist, the user
         needs no right to create tables. `now` is the present time; None: the clock of the database. Raises ServerError
         for tables of another version."""
+        import psycopg
+
         cursor.execute(f"SET LOCAL lock_timeout = '{PREPARE_S}s'; SET LOCAL timezone = 'UTC'")
         cursor.execute("SELECT pg_advisory_xact_lock(%s)", (_LOCK,))
         _check_version(cursor)
         missing = [table for table in TABLES if not _exists(cursor, table.name)]
         with_timescale = _has_timescale(cursor, is_wanted=any(table.is_by_time for table in missing))
         for table in missing:
-            _create(cursor, table, with_timescale=with_timescale)
+            try:
+                _create(cursor, table, with_timescale=with_timescale)
+            except psycopg.errors.InsufficientPrivilege as error:
+                raise ServerError(
+                    f"PostgreSQL: cannot create the table {table.name}: {error.diag.message_primary}; use a "
+                    "database that the user of the collector owns, or run GRANT CREATE ON SCHEMA public for this user"
+                ) from error
         if SCHEMA in missing:
             cursor.execute(f"INSERT INTO {SCHEMA.name} (version) VALUES (%s)", (SCHEMA_VERSION,))
         has_aggregates = _is_hypertable(cursor, INTERVALS) and _has_license(cursor)
@@ -284,46 +297,65 @@ class Upkeep:
 
     def _expire(self, cursor: Any, now: datetime) -> bool:
         """Remove some boots of gateways with more than `keep_boots` boots. Return whether more can be left."""
-        found = self._old_boots(cursor, now)
-        if not found:
+        if not self._old:
+            self._old = list(self._old_boots(cursor, now))
+        chosen, self._old = self._old[:BOOTS_STEP], self._old[BOOTS_STEP:]
+        if not chosen:
             return False
-        keys = {"gateways": [gateway for gateway, _ in found], "boots": [boot for _, boot in found]}
-        chosen = "IN (SELECT * FROM unnest(%(gateways)s::text[], %(boots)s::text[]))"
-        cursor.execute(
-            f"SELECT FROM {BOOTS.name} WHERE (gateway, boot) {chosen} ORDER BY gateway, boot FOR UPDATE", keys
-        )
-        cursor.execute(
-            f"SELECT gateway, boot FROM {LEDGER.name} WHERE (gateway, split_part(boot, '-', 1)) {chosen} "
-            "ORDER BY gateway, boot, device, stream FOR UPDATE", keys,
-        )  # fmt: skip
-        names = {*cursor, *found}  # also boots with -2, -3 …
+        keys = {"gateways": [gateway for gateway, _ in chosen], "boots": [boot for _, boot in chosen]}
+        locked = self._lock(cursor, keys)
         # a collector can have stored a message before the lock
-        if self._old_boots(cursor, now).keys() != found.keys():
-            return True
+        still = self._old_boots(cursor, now, keys["gateways"])
+        found = {key: still[key] for key in chosen if key in still}
+        keys = {"gateways": [gateway for gateway, _ in found], "boots": [boot for _, boot in found]}
+        # also boots with -2, -3 …
+        names = {*found, *(one for one in locked if (one[0], one[1].partition("-")[0]) in found)}
         if any(_delete_unset(cursor, table, names) for table in TIMED):
+            self._old = [*found, *self._old]
             return True
-        cursor.execute(f"DELETE FROM {LEDGER.name} WHERE (gateway, split_part(boot, '-', 1)) {chosen}", keys)
-        cursor.execute(f"DELETE FROM {BOOTS.name} WHERE (gateway, boot) {chosen}", keys)
+        cursor.execute(f"DELETE FROM {LEDGER.name} WHERE {_OF_BOOTS}", keys)
+        cursor.execute(f"DELETE FROM {BOOTS.name} WHERE (gateway, boot) {_CHOSEN}", keys)
         incomplete = sum(not is_complete for is_complete in found.values())
         self.expired_boots += len(found)
         self.expired_incomplete += incomplete
         log.info("PostgreSQL: removed %d old boots, %d of them with missing numbers", len(found), incomplete)
-        return len(found) == BOOTS_STEP
+        return bool(self._old)
 
-    def _old_boots(self, cursor: Any, now: datetime) -> dict[tuple[str, str], bool]:
-        """Return gateway and boot of boots to remove, and whether all numbers of the boot arrived."""
+    def _lock(self, cursor: Any, keys: Mapping[str, Sequence[str]]) -> Sequence[tuple[str, str]]:
+        """Lock boots and their ledgers, in the order of the collectors. Return gateway and boot of the ledgers."""
         cursor.execute(
-            "WITH streams AS (SELECT gateway, split_part(boot, '-', 1) AS boot, max(updated_at) AS updated_at, "
-            f"bool_and(missing = 0 AND coalesce(sent, newest) <= newest) AS complete FROM {LEDGER.name} "
-            "GROUP BY 1, 2), known AS (SELECT gateway, boot, coalesce(complete, true) AS complete, "
-            "greatest(first_at, updated_at) AS newest_at, row_number() OVER (PARTITION BY gateway "
-            "ORDER BY coalesce(first_at, updated_at) DESC, boot DESC) AS position "
-            f"FROM {BOOTS.name} FULL JOIN streams USING (gateway, boot)) "
-            "SELECT gateway, boot, complete FROM known WHERE position > %s AND (complete OR newest_at < %s) "
-            f"AND NOT EXISTS (SELECT FROM {GATEWAYS.name} AS state WHERE state.gateway = known.gateway "
-            "AND split_part(state.boot, '-', 1) = known.boot) ORDER BY gateway, boot LIMIT %s",
-            (self._settings.keep_boots, now - timedelta(days=SILENT_DAYS), BOOTS_STEP),
+            f"SELECT FROM {BOOTS.name} WHERE (gateway, boot) {_CHOSEN} ORDER BY gateway, boot FOR UPDATE", keys
         )
+        cursor.execute(
+            f"SELECT gateway, boot FROM {LEDGER.name} WHERE {_OF_BOOTS} "
+            "ORDER BY gateway, boot, device, stream FOR UPDATE", keys,
+        )  # fmt: skip
+        return list(cursor)
+
+    def _old_boots(
+        self, cursor: Any, now: datetime, gateways: Sequence[str] | None = None
+    ) -> dict[tuple[str, str], bool]:  # fmt: skip
+        """Return gateway and boot of boots to remove, and whether all numbers of the boot arrived. `gateways`: only
+        boots of these gateways; None: some boots of all gateways."""
+        many = f"SELECT gateway FROM {BOOTS.name} GROUP BY gateway HAVING count(*) > %(keep)s"
+        cursor.execute(
+            f"WITH many AS ({many if gateways is None else 'SELECT unnest(%(gateways)s::text[]) AS gateway'}), "
+            "streams AS (SELECT gateway, split_part(boot, '-', 1) AS boot, max(updated_at) AS updated_at, "
+            f"bool_and(missing = 0 AND coalesce(sent, newest) <= newest) AS complete FROM {LEDGER.name} "
+            "WHERE gateway IN (SELECT gateway FROM many) GROUP BY 1, 2), known AS (SELECT gateway, boot, "
+            "coalesce(complete, true) AS complete, greatest(first_at, updated_at) AS newest_at, row_number() OVER "
+            "(PARTITION BY gateway ORDER BY coalesce(first_at, updated_at) DESC, boot DESC) AS position "
+            f"FROM (SELECT * FROM {BOOTS.name} WHERE gateway IN (SELECT gateway FROM many)) AS boots "
+            "FULL JOIN streams USING (gateway, boot)) "
+            "SELECT gateway, boot, complete FROM known WHERE position > %(keep)s "
+            f"AND (complete OR newest_at < %(silent)s) AND NOT EXISTS (SELECT FROM {GATEWAYS.name} AS state "
+            "WHERE state.gateway = known.gateway AND split_part(state.boot, '-', 1) = known.boot) "
+            "ORDER BY gateway, boot LIMIT %(most)s",
+            {
+                "keep": self._settings.keep_boots, "silent": now - timedelta(days=SILENT_DAYS), "gateways": gateways,
+                "most": BOOTS_STEP * STEPS_MAX if gateways is None else None,
+            },
+        )  # fmt: skip
         return {(gateway, boot): complete for gateway, boot, complete in cursor}
 
 

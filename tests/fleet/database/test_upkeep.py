@@ -145,8 +145,12 @@ def test_tables_of_other_versions_are_rejected(database: Database) -> None:
 def test_a_user_who_does_not_own_the_tables_gets_one_log_line(
     database: Database, caplog: pytest.LogCaptureFixture
 ) -> None:
+    database.query("CREATE ROLE writer; SET ROLE writer")
+    with pytest.raises(ServerError, match=r"cannot create the table imud_samples: permission denied.*GRANT CREATE"):
+        database.prepare()
+    database.query("RESET ROLE")
     database.prepare()
-    database.query("CREATE ROLE writer; GRANT SELECT, INSERT, UPDATE, DELETE ON ALL TABLES IN SCHEMA public TO writer")
+    database.query("GRANT SELECT, INSERT, UPDATE, DELETE ON ALL TABLES IN SCHEMA public TO writer")
     database.query("SET ROLE writer")
     with caplog.at_level(logging.WARNING):
         made = database.prepare(NOW + 3 * DAY, events_days=1)
