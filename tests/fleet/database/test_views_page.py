@@ -64,7 +64,7 @@ def test_queries_have_rows(database: str) -> None:
 
 
 class FakeModule:
-    """Stands for pandas, which the tests do not need."""
+    """Substitute for pandas, which the tests do not need."""
 
     def DataFrame(self, rows: list[Any], columns: list[str]) -> Any:
         return [dict(zip(columns, row, strict=True)) for row in rows]
