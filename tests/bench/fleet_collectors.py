@@ -213,7 +213,8 @@ def main() -> int:
     for one in problems:
         print(f"problem: {one}")
     title = f"{args.gateways} gateways, {args.seconds:g} s, one collector killed every {args.interval:g} s"
-    program_run.save(args.json, [Table(title, [found])], problems)
+    rows = [{"figure": figure, "value": value} for figure, value in found.items()]
+    program_run.save(args.json, [Table(title, rows)], problems)
     return int(bool(problems))
 
 
