@@ -1,273 +1,313 @@
-"""`make fleet-load`: CPU time, memory and delays with many simulated gateways, a broker and one collector.
+"""`make fleet-load`: cost and delays of a broker, collectors and PostgreSQL with many simulated gateways.
 
-`python -m tests.bench.fleet_load [--gateways 1000] [--seconds 30] [--postgres] [--cluster]`. Each simulated gateway
-sends the messages of the output `mqtt` for two devices with `rate_hz: 10` and `batch_s: 1`: one message per second and
-device, with ten intervals of acceleration, rotation rate and angles. The collector is `FleetCollector` in a process of
-its own. With `--postgres` it writes rows. At the end, the gateways stop, and all numbered samples must arrive. The exit
-status is 1 if a sample is missing.
+`python -m tests.bench.fleet_load [--gateways 1000] [--devices 2] [--period 1] [--intervals 1] [--seconds 20]`. Each
+device sends one message per period. A message contains statistics of acceleration, rotation rate and angles, one
+interval per second of data: `--intervals 10 --period 10` is `batch_s: 10`. The collectors are processes of
+`imud fleet collect`. All parts run on this host.
 
-With `--cluster` (`make fleet-cluster`), the broker is a cluster of three NATS servers with JetStream and MQTT 3.1.1:
-each session and each message is on three servers. OUTPUTS further gateways are the output `mqtt` in processes of their
-own, each with a device at 1 kHz that sends every sample as a slot. After a third of the time, SIGKILL ends the server
-that the collector uses. Gateways and collector connect to the next server of their lists. Gateways send all messages
-without an acknowledgment again.
+The program measures three phases: *warm* (at least one period, all streams exist after it), *load* (the measurement),
+and *drain* (the gateways have stopped, the collectors store the rest). The CPU time of a part per message gives its
+saturation point, messages per second and core. If more messages are offered than the host can store, both phases
+*load* and *drain* show the part that uses the most CPU time. The exit status is 1 if a number or a row is missing.
 """
 
 import argparse
 import os
-import shutil
-import signal
-import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
-from time import monotonic, time_ns
+from time import monotonic, sleep, time_ns
 from typing import Final, NamedTuple
-from urllib.request import urlopen
 
-from imud.fleet.messages import FleetMessage, Interval, Measures, MessageKind, Stream, encode_message, topic_of
-from imud.model.sample import Sync
-from imud.model.units import NS_PER_MS, NS_PER_S
-from tests.bench.fleet_collector import END_S, CollectorProcess
-from tests.bench.mqtt_clients import Clients, MqttClient
-from tests.bench.rig import cpu_ns, rss_mb
-from tests.fleet.gateways import KilledGateway, in_spool
+from imud.fleet.messages import Stream
+from tests.bench.fleet_generator import (
+    RESERVED,
+    Generators,
+    Offer,
+    gateway_name,
+    raise_descriptor_limit,
+)
+from tests.bench.fleet_parts import CollectorProcess, FleetDatabase, Part
 from tests.fleet.mosquitto import NO_MOSQUITTO, running_broker
-from tests.fleet.postgres_server import NO_POSTGRES, running_postgres
+from tests.fleet.nats_cluster import NO_NATS, SERVERS, running_cluster
+from tests.fleet.postgres_server import NO_POSTGRES, PostgresServer, running_server
 from tests.support.daemon_process import wait_until
-from tests.support.results import ProgramRun, Table, add_json
-from tests.support.surroundings import free_port
+from tests.support.results import ProgramRun, Row, Table, add_json, printed
 
-DEVICES: Final = ("bow", "mast")
-SAMPLES: Final = 100  # per second and device
-INTERVALS: Final = 10  # per message: rate_hz 10
-NATS: Final = shutil.which("nats-server") or shutil.which("nats-server", path="/usr/sbin:/sbin")
-NATS_SERVERS: Final = 3
-OUTPUTS: Final = 3  # number of gateways of `--cluster` that run the output `mqtt`
-LIMIT_S: Final = 60.0  # end of a spool
-LOST: Final = "lost"
-OPEN: Final = "streams with an open ledger"
-
-
-class SimulatedGateway:
-    def __init__(self, number: int, ports: Sequence[int], due_s: float) -> None:
-        self.name = f"gw-{number}"
-        self.client = MqttClient(self.name, ports, first=number)
-        self.due_s = due_s
-        self.seq = 0
-
-    def second(self) -> None:
-        first, last = self.seq + 1, self.seq + SAMPLES
-        self.seq = last
-        for device in DEVICES:
-            message = FleetMessage(
-                v=1, gateway=self.name, boot="1", device=device, kind=MessageKind.INTERVALS, begin=1, first=first,
-                last=last, count=SAMPLES, utc_ns=time_ns(), intervals=intervals_of(first),
-            )  # fmt: skip
-            self.client.give(topic_of("load", self.name, device, Stream.STATISTICS), encode_message(message))
+# fsync stays on: its delay is part of the measurement
+POSTGRES: Final = "-c shared_buffers=512MB -c max_wal_size=8GB"
+NAME: Final = "load"
+READER: Final = f"imud-reader-{NAME}"  # start of the client identifiers of the collectors
+LOST: Final = "lost numbers"
+MISSING: Final = "missing rows"
+OPEN: Final = "open ledgers"
+MESSAGES_MIN: Final = 1000  # messages of the phase `drain` from which on its costs are meaningful
+WARM_S: Final = 5.0  # minimum time of the phase `warm`, s
+DRAIN_S: Final = 300.0  # maximum time of the phase `drain`, s
+PROBES: Final = 10  # gateways whose delay is measured
+PROBE_S: Final = 0.1  # interval of the polls, s: resolution of the delays
+BUSY: Final = 0.9  # Share of the usable cores. A part that uses more limits the messages per second.
 
 
-_MADE: dict[int, list[Interval]] = {}
+class Load(NamedTuple):
+    """Load of one run."""
 
+    gateways: int = 1000
+    devices: int = 2
+    period_s: float = 1.0
+    intervals: int = 1
+    collectors: int = 1
+    generators: int = 1
+    seconds: float = 20.0
+    is_cluster: bool = False
 
-def intervals_of(first: int) -> list[Interval]:
-    found = _MADE.get(first)
-    if found is None:
-        size = SAMPLES // INTERVALS
-        # all gateways of a second share the intervals: encoding must not limit the load
-        found = [_interval(begin, begin + size - 1) for begin in range(first, first + SAMPLES, size)]
-        _MADE[first] = found
-        # forget intervals of 100 s ago
-        _MADE.pop(first - 100 * SAMPLES, None)
-    return found
-
-
-def _interval(first: int, last: int) -> Interval:
-    def vector(scale: float) -> Measures:
-        value = (scale * first * 0.1234567, scale * 0.7654321, scale * 9.8066512)
-        return Measures(value, value, value, value)
-
-    t_ns = first * 10 * NS_PER_MS
-    return Interval(
-        first, last, last - first + 1, t_ns, t_ns + 90 * NS_PER_MS, t_ns, t_ns + 90 * NS_PER_MS, 1000, Sync.REGRESSION,
-        {"accel_m_s2": vector(1.0), "gyro_rad_s": vector(0.01), "euler_rad": vector(0.1)},
-    )  # fmt: skip
-
-
-class GatewayFleet:
-    def __init__(self, number: int, ports: Sequence[int]) -> None:
-        # 5 s for the connections; the gateways send at different moments of a second
-        begin_s = monotonic() + 5.0
-        self.gateways = [SimulatedGateway(one, ports, begin_s + one / number) for one in range(number)]
-        self.clients = Clients([one.client for one in self.gateways])
-        self.late_s = 0.0
-
-    def run(self, seconds: float) -> None:
-        begin_s = monotonic()
-        while monotonic() - begin_s < seconds:
-            self.clients.round(0.005)
-            now_s = monotonic()
-            for gateway in self.gateways:
-                if now_s >= gateway.due_s:
-                    self.late_s = max(self.late_s, now_s - gateway.due_s)
-                    gateway.due_s += 1.0
-                    gateway.second()
-                    if gateway.client.is_ready:
-                        self.clients.write(gateway.client)
-
-    def drain(self) -> float:
-        begin_s = monotonic()
-        while self.waiting and monotonic() - begin_s < END_S:
-            self.clients.round(0.02)
-        return monotonic() - begin_s
+    def offer(self) -> Offer:
+        return Offer(self.gateways, self.devices, self.intervals, self.period_s, time_ns())
 
     @property
-    def waiting(self) -> int:
-        return sum(len(one.client.waiting) for one in self.gateways)
+    def title(self) -> str:
+        return (
+            f"{self.gateways} gateways of {self.devices} devices, a message with {self.intervals} intervals every "
+            f"{self.period_s:g} s, {self.collectors} collectors"
+        )
 
-    @property
-    def numbered(self) -> int:
-        return len(DEVICES) * sum(one.seq for one in self.gateways)
+
+class Moment(NamedTuple):
+    """Counters at one moment."""
+
+    at_s: float
+    acknowledged: int
+    stored: int  # messages
+    idle_s: float  # idle time of all cores of the host
+    cpu_s: Mapping[str, float]  # by part
 
 
-class Servers(NamedTuple):
-    version: str
+class Outcome(NamedTuple):
+    figures: Mapping[str, float]  # the name contains the unit
+    parts: Sequence[Row]  # one row for each phase and part
+    limits: Mapping[str, str]  # part that limits the messages per second, by phase
+    problems: Sequence[str]
+
+    def cost(self, part: str) -> float:
+        """Return the CPU time of a part in the phase `load`, s per 1,000 messages."""
+        return self._of_load(part, CPU)
+
+    def memory(self, part: str) -> float:
+        """Return the memory of a part, MB."""
+        return self._of_load(part, MEMORY)
+
+    def _of_load(self, part: str, column: str) -> float:
+        return next(float(row[column]) for row in self.parts if row["part"] == part and row["phase"] == "load")
+
+    def tables(self, title: str) -> list[Table]:
+        return [Table(title, [dict(self.figures)]), Table(f"{title}: parts", self.parts)]
+
+
+CPU: Final = "CPU s per 1,000 messages"
+MEMORY: Final = "memory, MB"
+
+
+class Broker(NamedTuple):
+    part: Part
     ports: Sequence[int]
-    pids: Sequence[int]
+    version: str  # of MQTT
+    sessions: Callable[[], int]  # number of sessions with a subscription
 
 
 @contextmanager
-def mosquitto(folder: Path) -> Iterator[Servers]:
-    with running_broker(folder / "broker", "allow_anonymous true", "log_type error", "log_type information") as broker:
-        yield Servers("5", [broker.port], [broker.pid])
+def running_brokers(folder: Path, *, is_cluster: bool) -> Iterator[Broker]:
+    if is_cluster:
+        with running_cluster(folder) as cluster:
+            yield Broker(
+                Part("broker", lambda: cluster.pids, SERVERS), cluster.ports, "3.1.1",
+                lambda: sum(Stream.STATISTICS in one for one in cluster.filters()),
+            )  # fmt: skip
+        return
+    lines = ("allow_anonymous true", "log_type error", "log_type information", "log_type subscribe")
+    with running_broker(folder / "broker", *lines) as one:
+        yield Broker(
+            Part("broker", lambda: [one.pid]), [one.port], "5",
+            lambda: len({word for line in one.log for word in line.split() if word.startswith(READER)}),
+        )  # fmt: skip
 
 
-@contextmanager
-def nats_cluster(folder: Path) -> Iterator[Servers]:
-    assert NATS is not None
-    ports, monitors, routes = ([free_port() for _ in range(NATS_SERVERS)] for _ in range(3))
-    others = ", ".join(f'"nats://127.0.0.1:{route}"' for route in routes)
-    with ExitStack() as stack:
-        pids = []
-        for at, (port, monitor, route) in enumerate(zip(ports, monitors, routes, strict=True)):
-            config = folder / f"nats-{at}.conf"
-            config.write_text(f"""server_name: n{at}
-listen: "127.0.0.1:{free_port()}"
-http: "127.0.0.1:{monitor}"
-jetstream {{ store_dir: "{folder}/store-{at}" }}
-cluster {{ name: fleet, listen: "127.0.0.1:{route}", routes: [{others}] }}
-mqtt {{ listen: "127.0.0.1:{port}" }}
-""")
-            log = folder / f"nats-{at}.log"
-            process = stack.enter_context(subprocess.Popen([NATS, "-c", str(config), "-l", str(log)]))
-            stack.callback(process.kill)
-            pids.append(process.pid)
-        wait_until(lambda: all(map(is_healthy, monitors)), f"a NATS cluster; see the logs in {folder}")
-        yield Servers("3.1.1", ports, pids)
+class _Measurement:
+    """One run. Synchronization: one thread."""
+
+    def __init__(self, load: Load, broker: Broker, database: FleetDatabase, postgres: PostgresServer) -> None:
+        self._load, self._offer, self._database = load, load.offer(), database
+        self._generators: Generators
+        self._collectors: list[CollectorProcess] = []
+        self._parts = [broker.part, Part("database", lambda: [postgres.pid], load.collectors)]
+        self._broker, self._postgres = broker, postgres
+        self._delays_s: list[float] = []
+
+    def run(self, folder: Path, stack: ExitStack) -> Outcome:
+        load, offer = self._load, self._offer
+        options = ["--name", NAME, "--mqtt-version", self._broker.version]
+        options += ["--shares", str(load.collectors)] if load.collectors > 1 else []
+        for at in range(load.collectors):
+            log = folder / f"collector-{at}.log"
+            one = CollectorProcess(self._broker.ports, self._postgres.url, log, *options)
+            stack.callback(one.kill)
+            self._collectors.append(one)
+        pids = [one.pid for one in self._collectors]
+        self._parts.append(Part("collectors", lambda: pids, load.collectors))
+        # a message before the subscription would be lost
+        wait_until(
+            lambda: self._are_running() and self._broker.sessions() >= load.collectors, "all collectors subscribe"
+        )
+        self._generators = stack.enter_context(Generators(offer, self._broker.ports, load.generators))
+        self._parts.append(Part("generator", lambda: self._generators.pids))
+        begin_s = self._generators.begin()
+        self._wait(begin_s, max(WARM_S, load.period_s))
+        before = self._moment()
+        self._delays_s.clear()
+        self._generators.forget_delays()
+        self._wait(begin_s, max(load.seconds, load.period_s))
+        after = self._moment()
+        memory = {part.name: part.memory_mb() for part in self._parts}
+        late_s, delays_s = self._generators.late_s, sorted(self._delays_s) or [0.0]
+        self._generators.end()
+        drained = self._drain()
+        for one in self._collectors:
+            one.end()
+        offered, seconds = self._generators.offered, after.at_s - before.at_s
+        totals = self._database.totals(offer.boot)
+        rows = self._database.rows(offer.boot, offer.begin_utc_ns)
+        figures = {
+            "offered, 1/s": offer.per_second,
+            "acknowledged, 1/s": (after.acknowledged - before.acknowledged) / seconds,
+            "stored, 1/s": (after.stored - before.stored) / seconds,
+            "delay p50, s": delays_s[len(delays_s) // 2],
+            "delay p99, s": delays_s[len(delays_s) * 99 // 100],
+            "backlog at the end": after.acknowledged - after.stored,
+            "drain, s": drained.at_s - after.at_s,
+            "delay of the generator, s": late_s,
+            "streams": totals.streams,
+            "duplicates": totals.duplicates,
+            LOST: offered * offer.numbers - totals.whole,
+            MISSING: offered * offer.intervals - rows,
+            OPEN: totals.open,
+        }
+        phases = {"load": (before, after), "drain": (after, drained)}
+        parts = [row for name, (begin, end) in phases.items() for row in self._rows(name, begin, end, memory)]
+        limits = {name: limit_of(self._parts, begin, end) for name, (begin, end) in phases.items()}
+        problems = [f"{load.title}: {name} {figures[name]:g}" for name in (LOST, MISSING, OPEN) if figures[name]]
+        return Outcome(figures, parts, limits, problems)
+
+    def _are_running(self) -> bool:
+        for one in self._collectors:
+            one.check()
+        return True
+
+    def _moment(self) -> Moment:
+        acknowledged = self._generators.acknowledged
+        stored = self._database.whole(self._offer.boot) // self._offer.numbers
+        cpu_s = {part.name: part.cpu_s() for part in self._parts}
+        return Moment(monotonic(), acknowledged, stored, idle_s(), cpu_s)
+
+    def _wait(self, begin_s: float, seconds: float) -> None:
+        """Wait, and measure the delay of some gateways: from the due time of a message until other programs see its
+        rows."""
+        offer, end_s = self._offer, monotonic() + seconds
+        step = max(1, offer.gateways // PROBES)
+        numbers = range(0, offer.gateways, step)
+        due_s = {gateway_name(at): begin_s + offer.period_s * at / offer.gateways for at in numbers}
+        newest = self._database.newest(offer.boot, list(due_s))
+        while monotonic() < end_s:
+            sleep(PROBE_S)
+            self._are_running()
+            found = self._database.newest(offer.boot, list(due_s))
+            now_s = monotonic()
+            for name, number in found.items():
+                for at in range(newest.get(name, 0) // offer.numbers, number // offer.numbers):
+                    self._delays_s.append(now_s - due_s[name] - at * offer.period_s)
+            newest = found
+
+    def _drain(self) -> Moment:
+        """Wait until all offered messages are stored, at most DRAIN_S."""
+        end_s = monotonic() + DRAIN_S
+        while (moment := self._moment()).stored < self._generators.offered and moment.at_s < end_s:
+            self._are_running()
+            sleep(PROBE_S)
+        return moment
+
+    def _rows(self, phase: str, begin: Moment, end: Moment, memory: Mapping[str, float]) -> Iterator[Row]:
+        seconds = end.at_s - begin.at_s
+        stored, acknowledged = end.stored - begin.stored, end.acknowledged - begin.acknowledged
+        for name, end_cpu_s in end.cpu_s.items():
+            used_s = end_cpu_s - begin.cpu_s[name]
+            # the cost of a broker depends on both directions; in the phase `drain`, it only delivers
+            count = acknowledged if name == "generator" else stored
+            if phase == "drain" and (count < MESSAGES_MIN or name == "generator"):
+                continue
+            yield {
+                "phase": phase, "part": name, "messages, 1/s": count / seconds, CPU: 1000 * used_s / max(count, 1),
+                "messages per s and core": count / used_s if used_s else None, "cores": used_s / seconds,
+                MEMORY: memory[name],
+            }  # fmt: skip
 
 
-def is_healthy(monitor: int) -> bool:
-    """Return whether a server has joined the cluster and JetStream is ready."""
-    with suppress(OSError), urlopen(f"http://127.0.0.1:{monitor}/healthz", timeout=2) as answer:
-        return bool(answer.status == 200)
-    return False
+def idle_s() -> float:
+    """Return the idle time of all cores of the host, s."""
+    fields = Path("/proc/stat").read_text().split()
+    return (int(fields[4]) + int(fields[5])) / os.sysconf("SC_CLK_TCK")
 
 
-class Output:
-    def __init__(self, spool: Path, servers: Servers, name: str) -> None:
-        self._spool = spool
-        self.gateway = KilledGateway(servers.ports, spool, 1, name=name, version=servers.version)
-
-    def end(self) -> int:
-        """Send the rest of the spool and end the gateway. Return the number of used sequence numbers.
-
-        Raises TimeoutError if messages remain in the spool.
-        """
-        drained = self.gateway.drain(LIMIT_S)
-        self.gateway.kill()
-        rows, positions = in_spool(self._spool)
-        if not drained or rows:
-            raise TimeoutError(f"expected an empty spool within {LIMIT_S:g} s, got {len(rows)} messages")
-        return sum(one.last - one.begin + 1 for one in positions)
+def limit_of(parts: Sequence[Part], begin: Moment, end: Moment) -> str:
+    """Return the part that limits the messages per second. A part with one thread cannot use two cores."""
+    seconds = end.at_s - begin.at_s
+    used = {part: (end.cpu_s[part.name] - begin.cpu_s[part.name]) / seconds for part in parts}
+    if busy := [part for part in parts if used[part] >= BUSY * part.threads]:
+        return " and ".join(part.name for part in busy)
+    busiest = max(parts, key=lambda part: used[part])
+    if end.idle_s - begin.idle_s < (1 - BUSY) * seconds * (os.cpu_count() or 1):
+        return f"all cores of the host; most of it: {busiest.name}"
+    return "none"
 
 
-def measure(
-    servers: Servers, collector: CollectorProcess, fleet: GatewayFleet, seconds: float, outputs: Sequence[Output]
-) -> Iterator[tuple[str, float, str]]:
-    # 8 s until all gateways are connected and send
-    fleet.run(8.0)
-    # the last server is not killed
-    pids = {"broker": servers.pids[-1], "collector": collector.popen.pid, "gateways": os.getpid()}
-    before, acknowledged = {name: cpu_ns(pid) for name, pid in pids.items()}, acknowledged_by(fleet)
-    begin_s, fleet.late_s = monotonic(), 0.0
-    fleet.run(seconds / 3)
-    if len(servers.pids) > 1:
-        # the collector connects to the first server of the list
-        os.kill(servers.pids[0], signal.SIGKILL)
-    fleet.run(seconds * 2 / 3)
-    elapsed_s = monotonic() - begin_s
-    used = {name: (cpu_ns(pid) - before[name]) / NS_PER_S / elapsed_s for name, pid in pids.items()}
-    memory = {name: rss_mb(pid) for name, pid in pids.items()}
-    yield "messages acknowledged", (acknowledged_by(fleet) - acknowledged) / elapsed_s, "1/s"
-    yield "messages waiting at the end", float(fleet.waiting), ""
-    yield "maximum delay of a gateway", fleet.late_s, "s"
-    yield "time until all acknowledged", fleet.drain(), "s"
-    numbered = fleet.numbered + sum(one.end() for one in outputs)
-    account = collector.end(numbered)
-    fleet.clients.close()
-    for name in pids:
-        yield f"CPU of the {name}", used[name], "cores"
-        yield f"memory of the {name}", memory[name], "MB"
-    for name in ("p50_ms", "p99_ms", "max_ms"):
-        yield f"delay {name[:-3]}", account[name], "ms"
-    for name in ("streams", "connects"):
-        yield name, float(account[name]), ""
-    yield "duplicates", float(account["duplicates"]), "samples"
-    yield "numbered", float(numbered), "samples"
-    yield LOST, float(numbered - account["came"]), "samples"
-    yield OPEN, float(account["open"]), ""
-
-
-def acknowledged_by(fleet: GatewayFleet) -> int:
-    return sum(one.client.acknowledged for one in fleet.gateways)
+def run(load: Load, postgres: PostgresServer) -> Outcome:
+    """Start the parts, measure, and stop the parts. Raises RuntimeError or AssertionError if a part fails."""
+    raise_descriptor_limit(load.gateways + RESERVED)
+    with tempfile.TemporaryDirectory(prefix="imud-load-") as name, ExitStack() as stack:
+        folder = Path(name)
+        broker = stack.enter_context(running_brokers(folder, is_cluster=load.is_cluster))
+        database = stack.enter_context(closing(FleetDatabase(postgres.url)))
+        return _Measurement(load, broker, database, postgres).run(folder, stack)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="make fleet-load")
-    parser.add_argument("--gateways", type=int, default=1000)
-    parser.add_argument("--seconds", type=float, default=30.0)
-    parser.add_argument("--postgres", action="store_true", help="let the collector write rows into PostgreSQL")
-    parser.add_argument("--cluster", action="store_true", help="use three NATS servers, and kill one of them")
+    default = Load()
+    parser.add_argument("--gateways", type=int, default=default.gateways)
+    parser.add_argument("--devices", type=int, default=default.devices, help="devices per gateway")
+    parser.add_argument(
+        "--period", type=float, default=default.period_s, help="time between two messages of a device, s"
+    )
+    parser.add_argument("--intervals", type=int, default=default.intervals, help="intervals per message")
+    parser.add_argument("--collectors", type=int, default=default.collectors)
+    parser.add_argument("--generators", type=int, default=default.generators, help="processes with simulated gateways")
+    parser.add_argument("--seconds", type=float, default=default.seconds, help="time of the measurement")
+    parser.add_argument("--cluster", action="store_true", help="use three NATS servers with JetStream")
     add_json(parser)
     args, program_run = parser.parse_args(), ProgramRun()
-    no_nats = "" if NATS else "cannot find nats-server; try make mqtt-deps"
-    if missing := (no_nats if args.cluster else NO_MOSQUITTO) or (NO_POSTGRES if args.postgres else ""):
+    if missing := (NO_NATS if args.cluster else NO_MOSQUITTO) or NO_POSTGRES:
         print(missing)
         return 1
-    load = f"load {os.getloadavg()[0]:.1f} before"
-    print(f"{args.gateways} gateways of {len(DEVICES)} devices, {args.seconds:g} s, {os.cpu_count()} cores, {load}")
-    with tempfile.TemporaryDirectory(prefix="imud-load-") as name, ExitStack() as stack:
-        folder = Path(name)
-        to = stack.enter_context(running_postgres()) if args.postgres else ""
-        servers = stack.enter_context((nats_cluster if args.cluster else mosquitto)(folder))
-        # a message before the first connection of the collector would be lost
-        collector = CollectorProcess(servers.ports, version=servers.version, to=to)
-        outputs = [Output(folder / f"spool-{n}", servers, f"imud-{n}") for n in range(OUTPUTS * args.cluster)]
-        for one in outputs:
-            stack.callback(one.gateway.kill)
-            one.gateway.wait_until(0)
-        found = {}
-        for row, value, unit in measure(
-            servers, collector, GatewayFleet(args.gateways, servers.ports), args.seconds, outputs
-        ):
-            print(f"  {row:32} {value:12.2f} {unit}", flush=True)
-            found[row] = value, unit
-    rows = [{"figure": row, "value": value, "unit": unit} for row, (value, unit) in found.items()]
-    problems = [f"{row}: {found[row][0]:g}" for row in (LOST, OPEN) if found[row][0]]
-    program_run.save(args.json, [Table(f"{args.gateways} gateways", rows)], problems)
-    return int(bool(problems))
+    load = Load(
+        args.gateways, args.devices, args.period, args.intervals, args.collectors, args.generators, args.seconds,
+        args.cluster,
+    )  # fmt: skip
+    print(f"{load.title}; {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before", flush=True)
+    with running_server(POSTGRES) as postgres:
+        outcome = run(load, postgres)
+    for row in (outcome.figures, *outcome.parts, outcome.limits, *({"problem": one} for one in outcome.problems)):
+        print(f"  {printed(row)}")
+    program_run.save(args.json, outcome.tables(load.title), outcome.problems)
+    return int(bool(outcome.problems))
 
 
 if __name__ == "__main__":

@@ -41,7 +41,8 @@ class Mosquitto:
         config = self.folder / "mosquitto.conf"
         lines = (
             "per_listener_settings false", f"listener {self.port} 127.0.0.1", "persistence true",
-            f"persistence_location {self.folder}/", "max_queued_messages 0", "log_dest stderr", "log_type all",
+            f"persistence_location {self.folder}/", "max_queued_messages 0", "log_dest stderr",
+            *(() if any(line.startswith("log_type") for line in self.lines) else ("log_type all",)),
             *(("user root",) if own else ()), *self.lines, "",
         )  # fmt: skip
         config.write_text("\n".join(lines))

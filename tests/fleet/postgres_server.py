@@ -51,6 +51,11 @@ class PostgresServer:
             shutil.chown(folder, "postgres", "postgres")
         self._call("initdb", "-U", "imud", "--auth=trust", "--no-sync", "-E", "UTF8", "--locale=C")
 
+    @property
+    def pid(self) -> int:
+        """Return the process that starts all other processes of the server."""
+        return int((self.folder / "data/postmaster.pid").read_text().split()[0])
+
     def start(self) -> None:
         """Start the server and wait for a reply. After `kill`, it recovers from its log."""
         options = (
