@@ -15,7 +15,9 @@
 # make fleet-demo    a broker, three gateways with a simulated sensor each, and `imud fleet top` on them
 # make fleet-faults  a gateway, a broker and what can happen between them (ARGS="--seconds 120"), as a table
 # make fleet-collectors  three collectors divide a fleet, and SIGKILL ends one of them every 20 s
-# make fleet-load    1,000 simulated gateways, one broker, one collector   make fleet-cluster  three NATS servers, one is killed
+# make fleet-load    cost of a broker, collectors and a database with 1,000 simulated gateways (ARGS="--gateways 10000")
+# make fleet-scale   the same for many sizes, 25 minutes (ARGS=--short: 5 minutes)
+# make fleet-jetstream   three NATS servers store an hour for an absent collector; they are killed while it catches up
 # make bench-instructions   instructions per sample, beside those kept in the tree; make bench-deps   what it needs
 # make web-deps   installs chromium and its driver, for the tests of the page of `imud web`
 # make pictures   the pictures of README.md and docs/, into docs/pictures
@@ -139,7 +141,7 @@ audit: $(VENV)/made
 attack: $(VENV)/made
 	$(BIN)/python -m tests.attack $(ARGS)
 
-.PHONY: fleet-demo fleet-faults fleet-load fleet-cluster fleet-collectors
+.PHONY: fleet-demo fleet-faults fleet-load fleet-collectors fleet-scale fleet-jetstream
 fleet-demo: $(VENV)/made
 	$(BIN)/python -m tests.fleet.demo $(ARGS)
 
@@ -152,8 +154,11 @@ fleet-load: $(VENV)/made
 fleet-collectors: $(VENV)/made
 	$(BIN)/python -m tests.bench.fleet_collectors $(ARGS)
 
-fleet-cluster: $(VENV)/made
-	$(BIN)/python -m tests.bench.fleet_load --cluster --gateways 200 $(ARGS)
+fleet-scale: $(VENV)/made
+	$(BIN)/python -m tests.bench.fleet_scale $(ARGS)
+
+fleet-jetstream: $(VENV)/made
+	$(BIN)/python -m tests.bench.fleet_jetstream $(ARGS)
 
 soak: $(VENV)/made
 	$(BIN)/python -m tests.bench.soak $(ARGS)

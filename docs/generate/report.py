@@ -139,10 +139,23 @@ SUBJECTS: Final[Mapping[str, Subject]] = {
                 "lost samples and unbalanced ledgers",
             ),
             Run(
-                "fleet_load", "Load",
-                "Simulated gateways with two devices (one message per second and device, ten intervals in each "
-                "message), one mosquitto and one collector.",
-                by_hand="python -m tests.bench.fleet_load --gateways 1000", problems="lost samples and open ledgers",
+                "fleet_scale", "Load",
+                "Simulated gateways send one message per second and device with the statistics of one second (36 "
+                "values), mosquitto or NATS delivers them to `imud fleet collect`, and PostgreSQL stores one row for "
+                "each message. All parts run on the same host. The costs are CPU time per 1,000 messages: other load "
+                "on the host changes them only a little. For the growth, gateways send less often if the fleet would "
+                "offer more than the given messages per second (`period`). A delay is the time from the due time of "
+                "a message until its row is visible, with a resolution of 0.1 s.",
+                by_hand="python -m tests.bench.fleet_scale",
+                problems="lost numbers, missing rows and open ledgers",
+            ),
+            Run(
+                "fleet_jetstream", "JetStream as a buffer",
+                "Three NATS servers store an hour of messages while the collector is offline. Then the collector "
+                "catches up, while SIGKILL ends one server after another. Three more gateways with a device at 1 kHz "
+                "send live messages.",
+                by_hand="python -m tests.bench.fleet_jetstream",
+                problems="lost numbers, missing rows, open ledgers and missed goals",
             ),
             Run(
                 "fleet_collectors", "Several collectors",
