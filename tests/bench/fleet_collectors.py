@@ -1,8 +1,9 @@
 """`make fleet-collectors`: three collectors divide a fleet, and SIGKILL ends one of them every 20 s.
 
-`python -m tests.bench.fleet_collectors [--gateways 60] [--seconds 600]`. Simulated gateways (`tests.bench.fleet_load`)
-send one message per second for each of their two devices to mosquitto. Three processes `imud fleet collect --shares 3`
-write to one PostgreSQL database. SIGKILL ends the processes in turn. Each starts again after half of the interval.
+`python -m tests.bench.fleet_collectors [--gateways 60] [--seconds 600]`. Simulated gateways
+(`tests.bench.fleet_generator`) send one message per second for each of their two devices to mosquitto. Three processes
+`imud fleet collect --shares 3` write to one PostgreSQL database. SIGKILL ends the processes in turn. Each starts again
+after half of the interval.
 
 The program measures the time from each kill until another collector acknowledges a message of the same share. It reads
 this time from the log of mosquitto. A collector acknowledges a message after it has committed the message. At the end,
@@ -19,16 +20,18 @@ import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from time import monotonic
+from time import monotonic, sleep, time_ns
 from typing import Any, Final
 
-from tests.bench.fleet_load import DEVICES, INTERVALS, SAMPLES, GatewayFleet
+from tests.bench.fleet_generator import Generators, Offer
 from tests.fleet.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
 from tests.fleet.postgres_server import NO_POSTGRES, PostgresServer, running_server
 from tests.support.daemon_process import LIMIT_S, wait_until
 from tests.support.results import ProgramRun, Table, add_json, printed
 
 NAME: Final = "divided"
+DEVICES: Final = 2
+INTERVALS: Final = 10  # per message
 COLLECTORS: Final = 3
 TAKEOVER_MAX_S: Final = 30.0
 LOOK_S: Final = 0.1  # time between two reads of the log of the broker, s
@@ -125,12 +128,12 @@ def play(folder: Path, server: PostgresServer, gateways: int, seconds: float, in
         broker = stack.enter_context(running_broker(folder / "broker"))
         collectors = Collectors(broker, server.url, folder)
         stack.callback(collectors.close)
-        fleet = GatewayFleet(gateways, [broker.port])
-        stack.callback(fleet.clients.close)
-        begin_s, victim = monotonic(), 0
+        offer = Offer(gateways, DEVICES, INTERVALS, 1.0, time_ns())
+        fleet = stack.enter_context(Generators(offer, [broker.port]))
+        begin_s, victim = fleet.begin(), 0
         kill_s, start_s = begin_s + interval_s, 0.0
         while (now_s := monotonic()) < begin_s + seconds:
-            fleet.run(LOOK_S)
+            sleep(LOOK_S)
             collectors.look()
             if start_s and now_s >= start_s:
                 collectors.start(victim)
@@ -138,17 +141,19 @@ def play(folder: Path, server: PostgresServer, gateways: int, seconds: float, in
             if now_s >= kill_s:
                 collectors.kill(victim)
                 kill_s, start_s = kill_s + interval_s, now_s + interval_s / 2
-        fleet.drain()
+        fleet.end()
         end_s = monotonic() + END_S
-        while (collectors.without or stored(server.url, _LEDGER)[1] < fleet.numbered) and monotonic() < end_s:
-            fleet.clients.round(LOOK_S)
+        while monotonic() < end_s:
+            sleep(LOOK_S)
             collectors.look()
+            if not collectors.without and stored(server.url, _LEDGER)[1] >= fleet.offered * offer.numbers:
+                break
         statuses = collectors.end()
-        return figures(server, fleet, collectors, statuses)
+        return figures(server, offer, fleet.offered, collectors, statuses)
 
 
 def figures(
-    server: PostgresServer, fleet: GatewayFleet, collectors: Collectors, statuses: Sequence[int]
+    server: PostgresServer, offer: Offer, messages: int, collectors: Collectors, statuses: Sequence[int]
 ) -> dict[str, Any]:
     streams, _, missing, duplicates, open_streams = stored(server.url, _LEDGER)
     rows, samples, different = stored(server.url, _COUNTS)
@@ -158,9 +163,9 @@ def figures(
         "shares without a collector at the end": len(collectors.without),
         "longest time without a collector, s": max(takeovers_s, default=0.0),
         "median, s": takeovers_s[len(takeovers_s) // 2] if takeovers_s else 0.0,
-        "numbered samples": fleet.numbered, "samples in the database": int(samples),
-        "expected rows": fleet.numbered * INTERVALS // SAMPLES, "rows": rows, "different rows": different,
-        "streams": streams, "expected streams": len(fleet.gateways) * len(DEVICES), "missing": int(missing),
+        "numbered samples": messages * offer.numbers, "samples in the database": int(samples),
+        "expected rows": messages * offer.intervals, "rows": rows, "different rows": different,
+        "streams": streams, "expected streams": offer.gateways * offer.devices, "missing": int(missing),
         "open ledgers": open_streams, "repeated numbers, not stored again": int(duplicates),
         "violations of a primary key": (server.folder / "log").read_text().count("violates unique constraint"),
         "exit statuses other than 0": sum(status != 0 for status in statuses),
