@@ -38,9 +38,8 @@ OUTPUTS: Final = 3
 OUTPUT_BOOT: Final = boot_text(1)
 VERSION: Final = "3.1.1"
 TIMES: Final = "catch-up, times real time"
-# Time after which a server sends a message without an acknowledgement again; the default is 30 s. If `max_ack_pending`
-# messages of one topic of a session wait for an acknowledgement, the server counts the messages of the other topics as
-# sent, but does not send them before this time.
+# Time after which a server sends a message without an acknowledgement again; the default is 30 s. Some messages of a long
+# backlog arrive only after this time.
 MQTT: Final = 'ack_wait: "10s"'
 TOPICS: Final = 5  # topics of the collector's session
 DOWN_S: Final = 3.0  # time between the end of a server and its start, s
