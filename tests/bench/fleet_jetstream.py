@@ -38,8 +38,8 @@ OUTPUTS: Final = 3
 OUTPUT_BOOT: Final = boot_text(1)
 VERSION: Final = "3.1.1"
 TIMES: Final = "catch-up, times real time"
-# Time after which a server sends a message without an acknowledgement again; the default is 30 s. Some messages of a long
-# backlog arrive only after this time.
+# Time after which a server sends a message without an acknowledgement again; the default is 30 s. Some messages of a
+# long backlog arrive only after this time.
 MQTT: Final = 'ack_wait: "10s"'
 TOPICS: Final = 5  # topics of the collector's session
 DOWN_S: Final = 3.0  # time between the end of a server and its start, s
@@ -206,7 +206,7 @@ def run(plan: Plan) -> Outcome:
     raise_descriptor_limit(plan.gateways + RESERVED)
     with (
         tempfile.TemporaryDirectory(prefix="imud-jetstream-") as name,
-        running_server(POSTGRES) as postgres,
+        running_server(options=POSTGRES) as postgres,
         running_cluster(Path(name), MQTT) as cluster,
         ExitStack() as stack,
     ):

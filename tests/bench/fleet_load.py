@@ -37,7 +37,7 @@ from tests.support.daemon_process import wait_until
 from tests.support.results import ProgramRun, Row, Table, add_json, printed
 
 # fsync stays on: its delay is part of the measurement
-POSTGRES: Final = "-c shared_buffers=512MB -c max_wal_size=8GB"
+POSTGRES: Final = "-c fsync=on -c shared_buffers=512MB -c max_wal_size=8GB"
 NAME: Final = "load"
 READER: Final = f"imud-reader-{NAME}"  # start of the client identifiers of the collectors
 LOST: Final = "lost numbers"
@@ -302,7 +302,7 @@ def main() -> int:
         args.cluster,
     )  # fmt: skip
     print(f"{load.title}; {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} before", flush=True)
-    with running_server(POSTGRES) as postgres:
+    with running_server(options=POSTGRES) as postgres:
         outcome = run(load, postgres)
     for row in (outcome.figures, *outcome.parts, outcome.limits, *({"problem": one} for one in outcome.problems)):
         print(f"  {printed(row)}")

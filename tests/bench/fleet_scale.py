@@ -106,7 +106,7 @@ class _Scale:
     def _growth(self, name: str, sizes: Sequence[int], load_of: Callable[[int], Load]) -> Table:
         rows = []
         for size in sizes:
-            with running_server(POSTGRES) as postgres:
+            with running_server(options=POSTGRES) as postgres:
                 rows.append(self._costs({name: size}, load_of(size), postgres))
         return Table(f"Growth with {name}: {CPU}", rows)
 
@@ -115,7 +115,7 @@ class _Scale:
         sizes = self._sizes
         load = Load(round(sizes.rate), 1, seconds=sizes.seconds)
         rows, filled, bytes_per_row = [], 0, (0.0, 0.0)
-        with running_server(POSTGRES) as postgres, closing(FleetDatabase(postgres.url)) as database:
+        with running_server(options=POSTGRES) as postgres, closing(FleetDatabase(postgres.url)) as database:
             for size in sizes.rows:
                 begin_s = monotonic()
                 if size > filled:  # the first run creates the tables
@@ -145,7 +145,7 @@ class _Scale:
     def _runs(self, title: str, loads: Sequence[Load]) -> Table:
         rows: list[Row] = []
         for load in loads:
-            with running_server(POSTGRES) as postgres:
+            with running_server(options=POSTGRES) as postgres:
                 outcome = self._run(load, postgres)
             for phase, limit in outcome.limits.items():
                 parts = [row for row in outcome.parts if row["phase"] == phase]
