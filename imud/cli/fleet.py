@@ -318,6 +318,8 @@ async def _collect(args: argparse.Namespace) -> int:
     fleet = fleet_of(args, args.name, from_begin=args.from_begin)
     selection = Selection(args.site, args.gateway, args.device)
     is_postgres = args.to.startswith(("postgresql://", "postgres://"))
+    if PostAccess(args.to_token_file, args.to_ca_file) != OPEN and post_url(args.to) is None:
+        raise BadArgument("--to-token-file, --to-ca-file: expected --to with an http or https URL")
     if not is_postgres and not (args.config is None and args.shares is None and args.metrics is None):
         raise BadArgument("--config, --shares, --metrics: expected --to with a postgresql URL")
     store = None if is_postgres else store_of(args, fleet)
@@ -375,11 +377,9 @@ def settings_of(args: argparse.Namespace) -> CollectorSettings:
 
 def store_of(args: argparse.Namespace, fleet: Fleet) -> LedgerStore:
     """Open a store without a ledger of its own. Raises BadArgument, ServerError."""
-    url, access = post_url(args.to), PostAccess(args.to_token_file, args.to_ca_file)
+    url = post_url(args.to)
     if url is not None:
-        return LedgerStore(fleet, InfluxStore(HttpPost(url, access)))
-    if access != OPEN:
-        raise BadArgument("--to-token-file, --to-ca-file: expected --to with an http or https URL")
+        return LedgerStore(fleet, InfluxStore(HttpPost(url, PostAccess(args.to_token_file, args.to_ca_file))))
     if args.to == "-":
         return LedgerStore(fleet, JsonLines(sys.stdout))
     raise BadArgument(

@@ -77,6 +77,11 @@ def test_arguments_are_checked(cli: Cli) -> None:
         (["collect", "mqtt://host", "--to", "elsewhere"], "--to: expected"),
         (["collect", "mqtt://host", "--to", "postgresql://127.0.0.1:1/a"], "PostgreSQL: "),
         (["collect", "mqtt://host", "--to", "postgres://127.0.0.1:1/a"], "PostgreSQL: "),
+        (
+            ["collect", "mqtt://host", "--to", "-", "--to-token-file", "t"],
+            "--to-token-file, --to-ca-file: expected --to",
+        ),
+        (["collect", "mqtt://host", "--to", "postgresql:///a", "--to-ca-file", "t"], "--to-token-file, --to-ca-file: "),
         (["collect", "mqtt://host", "--to", "-", "--shares", "2"], "--config, --shares, --metrics: expected --to"),
         (["collect", "mqtt://host", "--to", "-", "--metrics", "127.0.0.1:0"], "--metrics: expected --to with a post"),
         (["collect", "mqtt://host", "--to", "postgresql:///a", "--metrics", "x"], "metrics: expected HOST:PORT"),
