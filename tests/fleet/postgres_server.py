@@ -60,7 +60,8 @@ class PostgresServer:
         """Start the server and wait for a reply. After `kill`, it recovers from its log."""
         options = (
             f"-k {self.folder} -c listen_addresses='' -c fsync=off -c shared_preload_libraries='{self._libraries}' "
-            + self._options
+            # a job of TimescaleDB runs only if a test runs it
+            f"-c timescaledb.max_background_workers=0 {self._options}"
         )
         self._call("pg_ctl", "-l", str(self.folder / "log"), "-w", "-t", str(LIMIT_S), "-o", options, "start")
         self._runs = True
