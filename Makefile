@@ -16,7 +16,7 @@
 # make fleet-faults  a gateway, a broker and what can happen between them (ARGS="--seconds 120"), as a table
 # make fleet-collectors  three collectors divide a fleet, and SIGKILL ends one of them every 20 s
 # make fleet-load    cost of a broker, collectors and a database with 1,000 simulated gateways (ARGS="--gateways 10000")
-# make fleet-scale   the same for many sizes, 25 minutes (ARGS=--short: 5 minutes)
+# make fleet-scale   the same for many sizes, 20 minutes (ARGS=--short: 5 minutes)
 # make fleet-jetstream   three NATS servers store an hour for an absent collector; they are killed while it catches up
 # make bench-instructions   instructions per sample, beside those kept in the tree; make bench-deps   what it needs
 # make web-deps   installs chromium and its driver, for the tests of the page of `imud web`
