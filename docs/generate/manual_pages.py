@@ -15,6 +15,7 @@ from typing import Final
 import msgspec
 
 from docs.generate import references
+from docs.generate.settings_parts import docs_of, settings_parts
 from imud import __version__
 from imud.cli import COMMANDS, build_parser
 from imud.formats.jsonrpc import DEFAULT_PATH
@@ -216,11 +217,11 @@ def configuration_page() -> Iterator[str]:
         "its errors. `systemctl reload imud` makes the daemon read the file again. The smallest useful file:"
     )
     yield from (".PP", ".EX", "devices:", "  front:", "    uart: {port: /dev/ttyUSB0}", ".EE")
-    for title, path, schema in references.settings_parts():
+    for title, path, schema in settings_parts():
         fields = msgspec.structs.fields(schema)
         if not fields:
             continue
-        docs = references.docs_of(schema)
+        docs = docs_of(schema)
         yield f".SH {escaped(re.sub('`', '', title).upper())}"
         for field in fields:
             default = references.default_of(field).strip("`")

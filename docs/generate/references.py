@@ -13,14 +13,11 @@
 | docs/socket.schema.json | messages of the socket (docs/generate/socket_schema.py) |
 """
 
-import ast
-import inspect
 import os
 import re
-import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain, groupby
-from typing import Final, NamedTuple, get_args
+from typing import Final, NamedTuple
 
 import msgspec
 
@@ -28,14 +25,10 @@ import imud.client
 import imud.sim
 from docs.generate.alert_table import alert_table
 from docs.generate.python_reference import python_reference
+from docs.generate.settings_parts import docs_of, settings_parts
 from docs.generate.socket_schema import socket_schema
-from imud.attitude.published import FrameOptions, MountingAngles, MountingAxes
-from imud.config.schema import TABLES, DeviceGeneral, General
 from imud.contracts.command import Handling, Verb, Verbs, parameters_of
-from imud.contracts.condition import ConditionLimits
 from imud.contracts.driver import Driver
-from imud.contracts.lines import LINE_SCHEMAS, DeviceLines
-from imud.contracts.status import Deviations
 from imud.device.settings_plan import described_settings
 from imud.drivers import DRIVERS
 from imud.fleet.database.settings import CollectorSettings
@@ -43,7 +36,6 @@ from imud.fleet.database.tables import COMPONENTS, Column
 from imud.fleet.database.tables import TABLES as DATABASE_TABLES
 from imud.fleet.database.views import views
 from imud.fleet.metrics import COLLECTOR_METRICS, FLEET_METRICS, CollectorMetric
-from imud.fleet.settings import DeviceSending
 from imud.fleet.statistics import MEASURES
 from imud.formats.ring import (
     HEADER_BYTES,
@@ -59,8 +51,8 @@ from imud.formats.slot import PRESENT_BITS, SLOT_BYTES, SLOT_FIELDS, SLOT_LAYOUT
 from imud.lines.sync import RESET, TRIGGER
 from imud.model.ledger import LEDGER_FIELDS
 from imud.model.options import Options, expected, shown
-from imud.utc.receivers import RmcOptions
 from tests.monitoring.prometheus import FLEET_RULES, RULES
+from tests.stability.interfaces import INTERFACES
 from tests.support.files import ROOT
 
 # --- values in cells --------------------------------------------------------------------------------------------------
@@ -117,57 +109,6 @@ class LongLists:
 
 
 # --- docs/configuration.md --------------------------------------------------------------------------------------------
-
-
-def docs_of(schema: type[Options]) -> dict[str, str]:
-    """Return the docstring below each field of a class and of its base classes."""
-    found: dict[str, str] = {}
-    for base in reversed(schema.__mro__):
-        if issubclass(base, Options):
-            found |= _own_docs_of(base)
-    return found
-
-
-def _own_docs_of(schema: type[Options]) -> dict[str, str]:
-    (made,) = ast.parse(textwrap.dedent(inspect.getsource(schema))).body
-    assert isinstance(made, ast.ClassDef)
-    found, name = {}, ""
-    for node in made.body:
-        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-            name = node.target.id
-        elif name and isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
-            found[name] = " ".join(str(node.value.value).split())
-            name = ""
-    return found
-
-
-LINE_TITLES = {name: text.rstrip(".") for name, text in docs_of(DeviceLines).items()}
-
-
-def settings_parts() -> Iterator[tuple[str, str, type[Options]]]:
-    yield "The daemon", "", General
-    for name, publisher in TABLES.publishers.items():
-        yield f"Output `{name}`", f"{name}.", publisher.settings
-        for field in msgspec.structs.fields(publisher.settings):
-            if isinstance(field.default, Options):
-                yield f"Output `{name}`: `{field.name}`", f"{name}.{field.name}.", type(field.default)
-    yield "Output `mqtt`: entries of `devices` (`docs/fleet.md`)", "mqtt.devices.NAME.", DeviceSending
-    yield "Each device", "devices.NAME.", DeviceGeneral
-    for name, link in TABLES.links.items():
-        yield f"Link `{name}`", f"devices.NAME.{name}.", link.settings
-    for name, driver in TABLES.drivers.items():
-        yield f"Options of driver `{name}`", "devices.NAME.options.", driver.settings
-        for field in msgspec.structs.fields(driver.settings):
-            for part in filter(lambda one: isinstance(one, type) and issubclass(one, Options), get_args(field.type)):
-                yield f"Option `{field.name}` of driver `{name}`", f"devices.NAME.options.{field.name}.", part
-    for name, schema in LINE_SCHEMAS.items():
-        yield f"Line `{name}`: {LINE_TITLES[name]}", f"devices.NAME.lines.{name}.", schema
-    yield "Mounting of the sensor (`docs/frames.md`)", "devices.NAME.frame.", FrameOptions
-    yield "Mounting by axes", "devices.NAME.frame.axes.", MountingAxes
-    yield "Mounting by angles", "devices.NAME.frame.euler.", MountingAngles
-    yield "Noise of a device, for covariances (`docs/export.md`)", "devices.NAME.noise.", Deviations
-    yield "Limits of the condition of a device (`docs/views.md`)", "devices.NAME.condition.", ConditionLimits
-    yield "RMC sentences for a device (`docs/time.md`)", "devices.NAME.rmc.", RmcOptions
 
 
 def default_of(field: msgspec.structs.FieldInfo) -> str:
@@ -474,8 +415,6 @@ def metrics_table(metrics: Sequence[CollectorMetric]) -> str:
 
 
 def versions() -> str:
-    from tests.stability.interfaces import INTERFACES  # which imports this module
-
     rows = [f"| [{name}](#{name}) | {one.version} | {one.read} |" for name, one in INTERFACES.items()]
     return "\n".join(["| interface | version | a program reads it from |", "|---|---|---|", *rows])
 

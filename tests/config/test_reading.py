@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import Meta
 
-from docs.generate import references
+from docs.generate.settings_parts import settings_parts
 from imud import config
 from imud.attitude.conventions import Heading
 from imud.attitude.published import FrameOptions, MountingAngles, MountingAxes
@@ -391,10 +391,10 @@ def test_shipped_file_has_every_key_of_every_row() -> None:
     present = {
         tuple("NAME" if i and p[i - 1] == "devices" else part for i, part in enumerate(p)) for p in tree.keys
     }  # fmt: skip
-    for _title, path, schema in references.settings_parts():
+    for _title, path, schema in settings_parts():
         for field in schema.__struct_fields__:
             assert (*path.split(".")[:-1], field) in present, f"{path}{field} is missing in etc/imud.yaml"
-    titles = {path for _title, path, _schema in references.settings_parts()}
+    titles = {path for _title, path, _schema in settings_parts()}
     assert {f"{name}." for name in PUBLISHERS} | {f"devices.NAME.{name}." for name in LINKS} <= titles
     assert TABLES.drivers is DRIVERS
 

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 from msgspec import Meta
 
-from docs.generate import references
+from docs.generate.settings_parts import settings_parts
 from imud.contracts.lines import LINE_SCHEMAS
 from imud.drivers import DRIVERS
 from imud.model.options import Options, WrongValue, expected, got, is_host, json_or_text, value_problem, wrong_values
@@ -24,7 +24,7 @@ WRONG: tuple[Any, ...] = (
 
 def schemas() -> Iterator[Any]:
     """Yield all structures that imud fills with values of the user."""
-    for title, _, schema in references.settings_parts():
+    for title, _, schema in settings_parts():
         yield pytest.param(schema, id=title)
     for name, schema in LINE_SCHEMAS.items():
         yield pytest.param(schema, id=f"line {name}")

@@ -9,9 +9,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from docs.generate import references
 from docs.generate.completions import FILES, completions, every_parser
 from docs.generate.manual_pages import escaped, help_of, marked, pages, sentence
+from docs.generate.settings_parts import settings_parts
 from imud.cli import COMMANDS, build_parser
 from imud.cli.doctor.command import STATUS
 from tests.support.daemon_process import LIMIT_S
@@ -81,7 +81,7 @@ def test_exit_statuses_are_those_of_each_command() -> None:
 
 def test_the_configuration_page_has_every_key_in_words_that_fit_a_line() -> None:
     text = PAGES["imud.yaml.5"]
-    keys = [path + field.name for _, path, one in references.settings_parts() for field in msgspec.structs.fields(one)]
+    keys = [path + field.name for _, path, one in settings_parts() for field in msgspec.structs.fields(one)]
     assert len(keys) > 100
     for key in keys:
         assert f".TP\n\\fB{escaped(key)}\\fR\n" in text, key

@@ -13,7 +13,7 @@ from unittest.mock import patch
 
 import msgspec
 
-from docs.generate.references import settings_parts
+from docs.generate.settings_parts import settings_parts
 from docs.generate.socket_schema import socket_document
 from imud import __version__, cli
 from imud.attitude.conventions import Heading
