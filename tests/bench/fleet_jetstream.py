@@ -28,7 +28,7 @@ from tests.bench.fleet_generator import RESERVED, Generators, Offer, raise_descr
 from tests.bench.fleet_load import LOST, MISSING, OPEN, POSTGRES
 from tests.bench.fleet_parts import CollectorProcess, FleetDatabase
 from tests.fleet.gateways import KilledGateway, in_spool
-from tests.fleet.nats_cluster import MESSAGES, NO_NATS, SERVERS, NatsCluster, running_cluster
+from tests.fleet.nats_cluster import MESSAGES, NO_NATS, SERVERS, NatsCluster, program_version, running_cluster
 from tests.fleet.postgres_server import NO_POSTGRES, PostgresServer, running_server
 from tests.support.daemon_process import wait_until
 from tests.support.results import ProgramRun, Row, Table, add_json, printed
@@ -226,7 +226,7 @@ def main() -> int:
         print(missing)
         return 1
     plan = Plan(args.gateways, args.devices, round(args.hours * 3600), args.kill_every)
-    title = f"{plan.gateways} gateways of {plan.devices} devices at 1 Hz, {args.hours:g} h offline"
+    title = f"{plan.gateways} gateways of {plan.devices} devices at 1 Hz, {args.hours:g} h offline, nats-server {program_version()}"
     print(title, flush=True)
     outcome = run(plan)
     for row in (outcome.figures, *outcome.kills, *({"problem": one} for one in outcome.problems)):
