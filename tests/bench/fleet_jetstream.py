@@ -226,7 +226,8 @@ def main() -> int:
         print(missing)
         return 1
     plan = Plan(args.gateways, args.devices, round(args.hours * 3600), args.kill_every)
-    title = f"{plan.gateways} gateways of {plan.devices} devices at 1 Hz, {args.hours:g} h offline, nats-server {program_version()}"
+    title = f"{plan.gateways} gateways of {plan.devices} devices at 1 Hz, {args.hours:g} h offline"
+    title += f", nats-server {program_version()}"
     print(title, flush=True)
     outcome = run(plan)
     for row in (outcome.figures, *outcome.kills, *({"problem": one} for one in outcome.problems)):
