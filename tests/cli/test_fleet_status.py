@@ -15,10 +15,10 @@ from imud.cli.fleet_status import ROWS_MAX, STATUS_HEAD, rejected_page
 from imud.fleet.database.overview import RejectedCounts
 from imud.fleet.metrics import PREFIX
 from tests.cli.conftest import Cli, Terminal, imud_process
-from tests.fleet.database.gateway_rows import add_gateways, add_rejected, make_tables, query
+from tests.fleet.database.gateway_rows import add_gateways, add_rejected, make_tables
 from tests.fleet.fleet_gateway import SendingGateway, samples_message
 from tests.fleet.mosquitto import Mosquitto
-from tests.fleet.postgres_server import NO_POSTGRES, running_postgres
+from tests.fleet.postgres_server import NO_POSTGRES, query, running_postgres
 from tests.support.daemon_process import LIMIT_S, wait_until
 from tests.support.surroundings import free_port
 

@@ -10,6 +10,7 @@ from imud.fleet.spool import Spool
 from tests.fleet.authority import Authority
 from tests.fleet.fleet_gateway import SendingGateway
 from tests.fleet.mosquitto import NO_MOSQUITTO, Mosquitto, running_broker
+from tests.fleet.postgres_server import NO_POSTGRES, PostgresServer, query, running_server
 from tests.fleet.proxy import Proxy
 
 
@@ -19,6 +20,21 @@ def broker(tmp_path: Path) -> Iterator[Mosquitto]:
         pytest.skip(NO_MOSQUITTO)
     with running_broker(tmp_path / "broker") as one:
         yield one
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[PostgresServer]:
+    if NO_POSTGRES:
+        pytest.skip(NO_POSTGRES)
+    with running_server() as made:
+        yield made
+
+
+@pytest.fixture
+def database(server: PostgresServer) -> str:
+    """Return the URL of an empty database."""
+    query(server.url, "DROP SCHEMA public CASCADE; CREATE SCHEMA public")
+    return server.url
 
 
 @pytest.fixture

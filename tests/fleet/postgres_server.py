@@ -7,11 +7,11 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 LIMIT_S: Final = 120
 _FOLDERS: Final = sorted(Path("/usr/lib/postgresql").glob("*/bin"), key=lambda one: float(one.parent.name))
@@ -100,3 +100,12 @@ def running_postgres() -> Iterator[str]:
     """Run a server during the block. Yield its URL."""
     with running_server() as server:
         yield server.url
+
+
+def query(url: str, text: str, values: Mapping[str, object] | Sequence[object] | None = None) -> list[Any]:
+    """Run a statement. Without `values`, `text` can contain several statements."""
+    import psycopg
+
+    with psycopg.connect(url) as connection:
+        cursor = connection.execute(text.encode(), values)
+        return cursor.fetchall() if cursor.description else []

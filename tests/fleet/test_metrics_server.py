@@ -13,8 +13,8 @@ from imud.fleet import metrics_server
 from imud.fleet.metrics_server import REFRESH_S, CollectorMetricsServer, FleetGauges
 from imud.model.errors import ServerError
 from imud.model.units import NS_PER_S
-from tests.fleet.database.gateway_rows import add_gateways, make_tables, query
-from tests.fleet.postgres_server import NO_POSTGRES, PostgresServer, running_server
+from tests.fleet.database.gateway_rows import add_gateways, make_tables
+from tests.fleet.postgres_server import NO_POSTGRES, PostgresServer, query, running_server
 from tests.fleet.test_metrics import IDLE
 from tests.support.daemon_process import LIMIT_S, wait_until
 

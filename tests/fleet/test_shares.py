@@ -15,10 +15,9 @@ from imud.fleet.reader import Fleet
 from imud.fleet.shares import Changes, FleetShares, LockView, ShareLocks, changes
 from imud.model.errors import BadArgument, ServerError
 from tests.bench.fleet_collectors import play, problems_of
-from tests.fleet.database.deliveries import query
 from tests.fleet.fleet_gateway import SendingGateway, samples_message
 from tests.fleet.mosquitto import NO_MOSQUITTO, Mosquitto
-from tests.fleet.postgres_server import NO_POSTGRES, PostgresServer, running_server
+from tests.fleet.postgres_server import PostgresServer, query
 from tests.fleet.test_connection import until
 from tests.support.daemon_process import LIMIT_S, wait_until
 from tests.support.event_loops import in_loop
@@ -56,20 +55,6 @@ def test_a_paused_share_is_left_to_others() -> None:
 
 
 live = pytest.mark.live
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[PostgresServer]:
-    if NO_POSTGRES:
-        pytest.skip(NO_POSTGRES)
-    with running_server() as made:
-        yield made
-
-
-@pytest.fixture
-def database(server: PostgresServer) -> str:
-    query(server.url, "DROP SCHEMA public CASCADE; CREATE SCHEMA public")
-    return server.url
 
 
 @contextmanager

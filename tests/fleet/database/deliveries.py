@@ -11,6 +11,7 @@ from imud.fleet.connection import FleetDelivery, ReaderConnection
 from imud.fleet.database.store import PostgresStore
 from imud.fleet.messages import FleetMessage, MessageKind, Stream, encode_message, topic_of
 from imud.fleet.reader import brokers_of
+from tests.fleet.postgres_server import query
 
 STREAMS = {MessageKind.INTERVALS: Stream.STATISTICS, MessageKind.EVENTS: Stream.EVENTS}
 BALANCE = "newest - begin + 1 - whole - thinned - dropped - missing"
@@ -37,14 +38,6 @@ def write(url: str, *contents: FleetMessage | GatewayState, from_begin: bool = F
     with closing(PostgresStore(url, from_begin=from_begin)) as store:
         store.write(deliveries(*contents))
     return store
-
-
-def query(url: str, text: str) -> list[Any]:
-    import psycopg
-
-    with psycopg.connect(url) as connection:
-        cursor = connection.execute(text.encode())
-        return cursor.fetchall() if cursor.description else []
 
 
 def ledgers(url: str, columns: str) -> list[Any]:

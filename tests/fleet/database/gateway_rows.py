@@ -1,19 +1,8 @@
 """Rows of a fleet in a real database, without a collector: gateways, boots, ledgers and rejected messages."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
-
 from imud.fleet.database.settings import CollectorSettings
 from imud.fleet.database.upkeep import Upkeep
-
-
-def query(url: str, text: str, values: Mapping[str, object] | Sequence[object] | None = None) -> list[Any]:
-    """Run a statement. Without `values`, `text` can contain several statements."""
-    import psycopg
-
-    with psycopg.connect(url) as connection:
-        cursor = connection.execute(text.encode(), values)
-        return cursor.fetchall() if cursor.description else []
+from tests.fleet.postgres_server import query
 
 
 def make_tables(url: str) -> None:

@@ -6,24 +6,18 @@ import pytest
 
 from imud.fleet.database.overview import FleetSelection, GatewayCondition, OverviewReader
 from imud.model.errors import BadArgument, ServerError
-from tests.fleet.database.gateway_rows import add_gateways, add_rejected, make_tables, query
-from tests.fleet.postgres_server import NO_POSTGRES, running_postgres
+from tests.fleet.database.gateway_rows import add_gateways, add_rejected, make_tables
+from tests.fleet.postgres_server import NO_POSTGRES, query
 from tests.support.daemon_process import LIMIT_S
 
 pytestmark = [pytest.mark.skipif(bool(NO_POSTGRES), reason=NO_POSTGRES), pytest.mark.live]
 EVERYTHING = FleetSelection()
 
 
-@pytest.fixture(scope="module")
-def server() -> Iterator[str]:
-    with running_postgres() as url:
-        yield url
-
-
 @pytest.fixture
-def database(server: str) -> str:
-    make_tables(server)
-    return server
+def database(database: str) -> str:
+    make_tables(database)
+    return database
 
 
 @pytest.fixture
@@ -105,14 +99,17 @@ def test_rejected_messages_are_newest_first_and_counted_by_reason(database: str,
     assert reader.payload(2**70) is None
 
 
-def test_errors_name_the_next_step_and_no_password(server: str) -> None:
+def test_errors_name_the_next_step_and_no_password(database: str) -> None:
     with pytest.raises(BadArgument, match="expected the database as a URL like postgresql://"):
         OverviewReader("mqtt://broker")
     with pytest.raises(ServerError, match=r"cannot parse the URL: .*does not show it") as caught:
         OverviewReader("postgresql://imud:secret@[::1")
     assert "secret" not in str(caught.value)
-    query(server, "DROP SCHEMA public CASCADE; CREATE SCHEMA public")
-    with OverviewReader(server) as reader, pytest.raises(ServerError, match="is this the database of `imud fleet coll"):
+    query(database, "DROP SCHEMA public CASCADE; CREATE SCHEMA public")
+    with (
+        OverviewReader(database) as reader,
+        pytest.raises(ServerError, match="is this the database of `imud fleet"),
+    ):
         reader.groups(EVERYTHING)
 
 

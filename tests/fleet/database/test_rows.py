@@ -14,7 +14,7 @@ from imud.fleet.reader import FleetBatch
 from imud.fleet.statistics import MEASURES, SCALARS, VECTORS
 from imud.model.event import Event, EventKind
 from imud.model.sample import SAMPLE_FIELDS, Position, Sample, Sync
-from tests.fleet.database.deliveries import query, write
+from tests.fleet.database.deliveries import write
 from tests.fleet.fleet_gateway import (
     UTC_NS,
     dropped_message,
@@ -24,6 +24,7 @@ from tests.fleet.fleet_gateway import (
     samples_message,
     synchronised,
 )
+from tests.fleet.postgres_server import query
 
 SIZES = {name: sum(one.field == name for one in COMPONENTS) for name in (*VECTORS, *SCALARS)}
 NAMES = {

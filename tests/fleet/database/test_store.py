@@ -19,7 +19,7 @@ from imud.fleet.statistics import SCALARS, VECTORS
 from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
 from imud.model.sample import Sample, Sync
-from tests.fleet.database.deliveries import BALANCE, deliveries, delivery, delivery_of, ledgers, query, write
+from tests.fleet.database.deliveries import BALANCE, deliveries, delivery, delivery_of, ledgers, write
 from tests.fleet.fleet_gateway import (
     UTC_NS,
     SendingGateway,
@@ -31,7 +31,7 @@ from tests.fleet.fleet_gateway import (
     synchronised,
 )
 from tests.fleet.mosquitto import Mosquitto
-from tests.fleet.postgres_server import NO_POSTGRES, running_server
+from tests.fleet.postgres_server import NO_POSTGRES, query, running_server
 from tests.support.daemon_process import LIMIT_S, wait_until
 
 pytestmark = [pytest.mark.skipif(bool(NO_POSTGRES), reason=NO_POSTGRES), pytest.mark.live]

@@ -17,7 +17,7 @@ from imud.fleet.database.store import PostgresStore
 from imud.fleet.database.transaction import DecodedDelivery, FleetTransaction, copy_rows
 from imud.fleet.messages import FleetMessage, GatewayClock, MessageKind, Stream
 from imud.model.errors import ServerError
-from tests.fleet.database.deliveries import BALANCE, delivery_of, ledgers, query, write
+from tests.fleet.database.deliveries import BALANCE, delivery_of, ledgers, write
 from tests.fleet.fleet_gateway import (
     UTC_NS,
     dropped_message,
@@ -26,6 +26,7 @@ from tests.fleet.fleet_gateway import (
     samples_message,
     synchronised,
 )
+from tests.fleet.postgres_server import PostgresServer, query
 from tests.support.daemon_process import LIMIT_S, wait_until
 
 pytestmark = pytest.mark.live
@@ -52,13 +53,15 @@ def made(kind: MessageKind, first: int, last: int, boot: str, *, has_clock: bool
 
 
 @given(turns=TURNS, from_begin=st.booleans())
-def test_rows_are_exactly_once_for_any_order_and_any_collector(server: str, turns: Any, *, from_begin: bool) -> None:
+def test_rows_are_exactly_once_for_any_order_and_any_collector(
+    server: PostgresServer, turns: Any, *, from_begin: bool
+) -> None:
     """Two collectors receive messages of two streams of one boot. A clock is known in some of the messages."""
     gateway = f"gw-{next(NUMBER)}"
     seen: dict[str, dict[int, MessageKind]] = {"1": {}, "1-2": {}}
     ranges: set[tuple[str, int, int, MessageKind]] = set()
     arrived, is_known = dict.fromkeys(seen, 0), False
-    one, two = stores = [PostgresStore(server, from_begin=from_begin) for _ in range(2)]
+    one, two = stores = [PostgresStore(server.url, from_begin=from_begin) for _ in range(2)]
     with closing(one), closing(two):
         for number, content in turns:
             messages = []
@@ -74,7 +77,7 @@ def test_rows_are_exactly_once_for_any_order_and_any_collector(server: str, turn
             stores[number].write(messages)
 
     def rows(columns: str, table: str) -> list[Any]:
-        return query(server, f"SELECT {columns} FROM {table} WHERE gateway = '{gateway}' ORDER BY 1, 2, 3")
+        return query(server.url, f"SELECT {columns} FROM {table} WHERE gateway = '{gateway}' ORDER BY 1, 2, 3")
 
     assert rows(f"boot, begin, newest, whole, thinned, dropped, missing, duplicates, {BALANCE}", "imud_ledger") == [
         (
