@@ -32,9 +32,9 @@ def rows(*, quick: bool = False) -> Iterator[Row]:
 
 
 def loads_of(plain: Load) -> dict[str, Load]:
-    loads = {"bare loop": replace(plain, bare=True), "at once": plain}
+    loads = {"bare loop": replace(plain, bare=True), "default latency": plain}
     if plain.clients == 1:
-        loads["at once, recorded"] = replace(plain, recorded=True)
+        loads["default latency, recorded"] = replace(plain, recorded=True)
     if plain.clients == VARIED:
         loads["bare loop that waits 10 ms before a read"] = replace(plain, bare=True, latency_ms=LATENCY_MS)
         loads["latency 10 ms"] = replace(plain, latency_ms=LATENCY_MS)
@@ -50,7 +50,7 @@ def compare(plain: Load, rounds: int) -> Iterator[Row]:
         for name, load in loads.items():
             found[name].append(run(load))
     # the bare loop of the same round is the reference
-    bare, at_once = found["bare loop"], found["at once"]
+    bare, default = found["bare loop"], found["default latency"]
     for name, outcomes in found.items():
         words = f"1 kHz, {plain.clients} {plain.encoding} clients, {name}"
         yield Row(f"{words}: CPU per sample", median(o.cpu_us_per_sample for o in outcomes), "µs")
@@ -59,16 +59,16 @@ def compare(plain: Load, rounds: int) -> Iterator[Row]:
         if not loads[name].bare:
             yield at_most(f"{words}: samples lost", float(max(o.lost for o in outcomes)), "samples", 0)
         ratio, words = ratio_of("cpu_us_per_sample", outcomes, bare), f"{words}: CPU / bare loop"
-        if outcomes is at_once:
+        if outcomes is default:
             yield at_most(words, ratio, "x", CPU_LIMITS[plain.clients])
             yield at_most(f"{words}, p99", ratio_of("p99_us", outcomes, bare), "x", P99_LIMIT)
         elif name in JUDGED:
             yield at_most(words, ratio, "x", CPU_AIM)
         elif outcomes is not bare:
             yield Row(words, ratio, "x")
-    if recorded := found.get("at once, recorded"):
-        ratio = ratio_of("cpu_us_per_sample", recorded, at_once)
-        words = f"1 kHz, {plain.clients} {plain.encoding} clients, at once, recorded: CPU / not recorded"
+    if recorded := found.get("default latency, recorded"):
+        ratio = ratio_of("cpu_us_per_sample", recorded, default)
+        words = f"1 kHz, {plain.clients} {plain.encoding} clients, default latency, recorded: CPU / not recorded"
         yield at_most(words, ratio, "x", RECORDED_LIMIT)
 
 
