@@ -142,11 +142,11 @@ def column(results: Results, table: int, name: str, **wanted: str) -> list[Any]:
 
 
 def latency_ratio(found: Mapping[str, Results]) -> float:
-    held, at_once = (
+    held, default = (
         column(found["bench"], 0, "CPU per sample, µs", case=f"1 kHz, 10 binary clients, {case}")[0]
-        for case in ("latency 10 ms", "at once")
+        for case in ("latency 10 ms", "default latency")
     )
-    return float(held / at_once)
+    return float(held / default)
 
 
 def largest_tilt(found: Mapping[str, Results]) -> float:
