@@ -17,6 +17,7 @@
 # make fleet-collectors  three collectors divide a fleet, and SIGKILL ends one of them every 20 s
 # make fleet-load    cost of a broker, collectors and a database with 1,000 simulated gateways (ARGS="--gateways 10000")
 # make fleet-scale   the same for many sizes, 20 minutes (ARGS=--short: 5 minutes)
+# make fleet-retention   cost and size of 10 to 1000 stored days, in partitions and in TimescaleDB, 10 minutes
 # make fleet-jetstream   three NATS servers store an hour for an absent collector; they are killed while it catches up
 # make bench-instructions   instructions per sample, beside those kept in the tree; make bench-deps   what it needs
 # make web-deps   installs chromium and its driver, for the tests of the page of `imud web`
@@ -141,7 +142,7 @@ audit: $(VENV)/made
 attack: $(VENV)/made
 	$(BIN)/python -m tests.attack $(ARGS)
 
-.PHONY: fleet-demo fleet-faults fleet-load fleet-collectors fleet-scale fleet-jetstream
+.PHONY: fleet-demo fleet-faults fleet-load fleet-collectors fleet-scale fleet-retention fleet-jetstream
 fleet-demo: $(VENV)/made
 	$(BIN)/python -m tests.fleet.demo $(ARGS)
 
@@ -156,6 +157,9 @@ fleet-collectors: $(VENV)/made
 
 fleet-scale: $(VENV)/made
 	$(BIN)/python -m tests.bench.fleet_scale $(ARGS)
+
+fleet-retention: $(VENV)/made
+	$(BIN)/python -m tests.bench.fleet_retention $(ARGS)
 
 fleet-jetstream: $(VENV)/made
 	$(BIN)/python -m tests.bench.fleet_jetstream $(ARGS)

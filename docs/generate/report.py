@@ -150,6 +150,13 @@ SUBJECTS: Final[Mapping[str, Subject]] = {
                 problems="lost numbers, missing rows and open ledgers",
             ),
             Run(
+                "fleet_retention", "Retention",
+                "The table `imud_intervals` with 24 values per row and one partition or chunk per day, after different "
+                "numbers of days. The values are random, so that compression has little effect on them. Times are the "
+                "minimum of five calls.",
+                by_hand="python -m tests.bench.fleet_retention",
+            ),
+            Run(
                 "fleet_jetstream", "JetStream as a buffer",
                 "Three NATS servers store an hour of messages while the collector is offline. Then the collector "
                 "catches up, while SIGKILL ends one server after another. Three more gateways with a device at 1 kHz "
