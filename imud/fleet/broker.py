@@ -36,6 +36,7 @@ UNANSWERED: Final = (
 )
 REFUSED: Final = 0x80  # lowest reason code of a refusal (MQTT 5.0, section 2.4)
 QUOTA: Final = 0x97  # reason code "Quota exceeded" (MQTT 5.0, section 2.4)
+UNCLAIMED: Final = 0x10  # reason code "No matching subscribers" (MQTT 5.0, section 2.4)
 # Maximum length of a file of certificates, bytes. The file with all authorities of Debian has 0.2 MB.
 PEM_BYTES: Final = 4 << 20
 MQTT_5: Final = 5  # value of `MQTTv5` in paho-mqtt: protocol version in CONNECT (MQTT 5.0, section 3.1.2.2)
@@ -301,6 +302,9 @@ class BrokerConnection(Protocol):
 
     # Packet identifiers of acknowledged messages and accepted subscriptions. The reader clears the list.
     acknowledged: list[int]
+    # Packet identifiers in `acknowledged` of messages that the broker discarded, because no client has a subscription.
+    # Only some brokers with MQTT 5 report this. The reader clears the set.
+    unclaimed: set[int]
     in_flight_max: int  # maximum number of messages without an acknowledgement
     received: list[Received]  # Messages received from subscriptions. The reader clears the list.
     # Packet identifiers of refused messages and subscriptions with the reason. The reader clears the list.
@@ -351,6 +355,7 @@ class PahoConnection:
         """Connect and wait for CONNACK. Raises BrokerError. This method calls `is_wanted` after the socket is open and
         then every LOOK_S. If it returns False, another output may use the same client ID soon."""
         self.acknowledged: list[int] = []
+        self.unclaimed: set[int] = set()
         self.in_flight_max = IN_FLIGHT_MAX
         self.received: list[Received] = []
         self.refused: list[tuple[int, str]] = []
@@ -510,6 +515,8 @@ class PahoConnection:
                 self.refused.append((mid, str(reason)))
             return
         self.acknowledged.append(mid)
+        if reason is not None and reason.value == UNCLAIMED:
+            self.unclaimed.add(mid)
 
     def _on_message(self, _client: Any, _data: Any, message: Any) -> None:
         if not self._answered or len(self.received) >= RECEIVED_MAX:

@@ -380,7 +380,7 @@ class MqttPublisher:
         for topic in sender.refused.keys() - before_refused.keys():
             self._raise(
                 now_ns, f"the broker refuses messages of {topic}: {sender.refused[topic]}; imud sends all other "
-                f"messages and tries this topic again later; check the access rights of the gateway",
+                "messages and tries this topic again later",
             )  # fmt: skip
         for topic in before_refused.keys() - sender.refused.keys():
             self._raise(now_ns, f"the broker accepts messages of {topic} again")

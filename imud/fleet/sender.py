@@ -53,8 +53,12 @@ LOSSES_MAX: Final = 3
 # Time for which imud skips a refused topic, ns. It doubles with each further refusal: a test can cost a connection.
 SKIP_NS: Final = 60 * NS_PER_S
 SKIP_MOST_NS: Final = 3600 * NS_PER_S
-# Maximum number of refused topics, and of suspected topics. imud forgets the oldest.
+# Maximum number of refused topics, of suspected topics, and of topics with a subscriber. imud forgets the oldest.
 TOPICS_MAX: Final = 500
+# Time for which imud keeps messages without a subscriber, if their topic had a subscriber before, ns. After a restart,
+# a broker can have no subscription until the collectors connect again.
+UNCLAIMED_NS: Final = 300 * NS_PER_S
+UNCLAIMED_SKIP_NS: Final = 10 * NS_PER_S  # time between two tests of such a topic, ns
 
 
 def is_subscription(topic: str) -> bool:
@@ -102,14 +106,16 @@ class TopicRefusals:
     def losses(self, topic: str) -> int:
         return self._suspects.get(topic, 0)
 
-    def refuse(self, topic: str, problem: str, now_ns: int) -> None:
-        """Skip a topic, because the broker refused a message. Do nothing for a skipped topic."""
+    def refuse(self, topic: str, problem: str, now_ns: int, skip_ns: int | None = None) -> None:
+        """Skip a topic for `skip_ns`, because the broker refused a message; None: for a time that grows with each
+        refusal. Do nothing for a skipped topic."""
         if topic in self._skipped:
             return
         if is_subscription(topic):
             problem += "; commands over MQTT do not work"
         known = self._refused.pop(topic, None)
-        skip_ns = SKIP_NS if known is None else min(2 * known.skip_ns, SKIP_MOST_NS)
+        if skip_ns is None:
+            skip_ns = SKIP_NS if known is None else min(2 * known.skip_ns, SKIP_MOST_NS)
         self._suspects.pop(topic, None)
         self._refused[topic] = _Refusal(problem, skip_ns, now_ns + skip_ns)
         self._skipped[topic] = None
@@ -189,6 +195,8 @@ class MqttSender:
         self._unanswered = ""  # `problem` of missing acknowledgements
         self._has_answer = False  # whether an acknowledgement arrived after `_unanswered`
         self._refusals = TopicRefusals()
+        # time of the newest acknowledgement of a message that had a subscriber, by topic
+        self._claimed_ns: dict[str, int] = {}
         self._answers: list[tuple[int, int]] = []
         self._retained: dict[str, bytes] = {}  # newest payload by topic
         self._due: dict[str, None] = {}  # topics of retained messages to send, in order
@@ -404,13 +412,16 @@ class MqttSender:
         """Pass the acknowledgements to the writer, and skip the topics of refused messages."""
         refused, connection.refused = connection.refused, []
         for number, problem in refused:
-            if (message := self._in_flight.pop(number, None)) is not None:
+            with self._lock:
+                message = self._in_flight.pop(number, None)
+            if message is not None:
                 self.replies_lost += message.reply is not None
-                self._refuse(message.topic, problem)
+                self._refuse(message.topic, f"{problem}; check the access rights of the gateway")
         if not connection.acknowledged:
             return
-        numbers = connection.acknowledged[:]
-        connection.acknowledged.clear()
+        numbers, connection.acknowledged = connection.acknowledged, []
+        unclaimed, connection.unclaimed = connection.unclaimed, set()
+        numbers = [one for one in numbers if not self._is_kept(one, is_claimed=one not in unclaimed)]
         with self._lock:
             self._answered_ns, self._has_answer = self._now_ns(), True
             messages = [self._in_flight.pop(number) for number in numbers if number in self._in_flight]
@@ -454,10 +465,34 @@ class MqttSender:
 
     # --- refused topics -----------------------------------------------------------------------------------------------
 
-    def _refuse(self, topic: str, problem: str) -> None:
+    def _is_kept(self, number: int, *, is_claimed: bool) -> bool:
+        """Return whether an acknowledged message stays in the spool: it had no subscriber, but its topic had one in the
+        last UNCLAIMED_NS. imud sends this message again."""
+        message = self._in_flight.get(number)
+        if message is None or not message.row:
+            return False
+        topic, now_ns = message.topic, self._now_ns()
+        if is_claimed:
+            self._claimed_ns.pop(topic, None)
+            self._claimed_ns[topic] = now_ns
+            if len(self._claimed_ns) > TOPICS_MAX:
+                del self._claimed_ns[next(iter(self._claimed_ns))]
+            return False
+        if topic not in self._claimed_ns or now_ns - self._claimed_ns[topic] > UNCLAIMED_NS:
+            return False
+        with self._lock:
+            del self._in_flight[number]
+        problem = (
+            "no client has a subscription of this topic any more; imud keeps the messages for at most "
+            f"{UNCLAIMED_NS // NS_PER_S} s: does a collector run?"
+        )
+        self._refuse(topic, problem, UNCLAIMED_SKIP_NS)
+        return True
+
+    def _refuse(self, topic: str, problem: str, skip_ns: int | None = None) -> None:
         """Skip a topic. Its rows stay in the spool; the newest retained message stays in memory."""
         with self._lock:
-            self._refusals.refuse(topic, problem, self._now_ns())
+            self._refusals.refuse(topic, problem, self._now_ns(), skip_ns)
         self._update_refusals()
 
     def _end_refusals(self) -> None:

@@ -11,6 +11,7 @@ from tests.support.daemon_process import LIMIT_S
 class FakeConnection:
     def __init__(self, broker: "FakeBroker") -> None:
         self.acknowledged: list[int] = []
+        self.unclaimed: set[int] = set()
         self.in_flight_max = broker.window
         self.received: list[Received] = []
         self.refused: list[tuple[int, str]] = []
@@ -55,6 +56,8 @@ class FakeConnection:
                 self.refused.append((self._answered, "Not authorized"))
             elif topic not in self._broker.ignores:
                 self.acknowledged.append(self._answered)
+                if topic in self._broker.unclaimed:
+                    self.unclaimed.add(self._answered)
         if self._broker.blocks and not self.acknowledged:
             self._bell.wait(seconds)
             self._bell.clear()
@@ -80,6 +83,7 @@ class FakeBroker:
         self.window = 4
         self.closes_on: set[str] = set()  # topics for which the broker closes the connection
         self.refuses: set[str] = set()  # topics that the broker refuses with a reason
+        self.unclaimed: set[str] = set()  # topics without a subscriber
         self.ignores: set[str] = set()  # topics that the broker never acknowledges
         self.rejects: set[str] = set()  # topics whose messages are too long for the broker
         self.will: Will | None = None

@@ -118,6 +118,7 @@ class Collector:
         self.ledger = FleetLedger(from_begin=True)
         self.messages: list[tuple[str, bytes]] = []  # all received messages in their order
         self.fresh: list[FleetMessage] = []  # received messages of streams without duplicates
+        self.subscribes_again = True  # whether the collector subscribes at each connection
         self._changed = threading.Condition()
         self._topic = topic
         self._client = Client(CallbackAPIVersion.VERSION2, "collector", protocol=MQTTv5)
@@ -133,7 +134,8 @@ class Collector:
         assert self._subscribed.wait(LIMIT_S)
 
     def _on_connect(self, client: Any, *_: object) -> None:
-        client.subscribe(self._topic, qos=1)
+        if self.subscribes_again:
+            client.subscribe(self._topic, qos=1)
 
     def _on_message(self, _client: object, _data: object, message: Any) -> None:
         with self._changed:
@@ -150,6 +152,11 @@ class Collector:
         """Wait until `true` returns True. Check it after each message."""
         with self._changed:
             assert self._changed.wait_for(true, limit_s), self.ledger.counts
+
+    def subscribe(self) -> None:
+        """Subscribe now and at each connection."""
+        self.subscribes_again = True
+        self._client.subscribe(self._topic, qos=1)
 
     def close(self) -> None:
         if not hasattr(self, "_client"):

@@ -15,6 +15,7 @@ import pytest
 
 from imud.fleet.accounts import FleetLedger, StreamCounts
 from imud.fleet.messages import Stream, decode_message
+from imud.model.units import NS_PER_S
 from tests.fleet.gateways import KilledGateway, LiveGateway, closes, in_spool
 from tests.fleet.mosquitto import NO_MOSQUITTO, Collector, Mosquitto, running_broker
 from tests.fleet.proxy import Proxy
@@ -51,6 +52,25 @@ def test_a_restart_of_the_broker_loses_nothing(tmp_path: Path, broker: Mosquitto
         broker.start()
         gateway.wait_for(lambda: bool(gateway.output.status().broker))
     assert gateway.output.status().reconnects == 3
+    finish(gateway, collector)
+
+
+def test_a_restart_of_the_broker_with_shares_loses_nothing(
+    tmp_path: Path, broker: Mosquitto, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a restart, mosquitto has the sessions, but no shared subscription until the collector subscribes again."""
+    monkeypatch.setattr("imud.fleet.sender.UNCLAIMED_SKIP_NS", NS_PER_S // 10)
+    collector = Collector(broker.port, "$share/fleet/imud/#")
+    gateway = LiveGateway(tmp_path / "spool", broker.port)
+    gateway.publish(1000)
+    gateway.wait_for(lambda: gateway.output.status().acknowledged > 0)
+    collector.subscribes_again = False
+    broker.stop()
+    broker.start()
+    gateway.publish(1000)
+    gateway.wait_for(lambda: "imud/default/gw/bow/samples" in gateway.output.status().refused)
+    collector.subscribe()
+    gateway.wait_for(lambda: not gateway.output.status().refused)
     finish(gateway, collector)
 
 

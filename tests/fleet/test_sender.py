@@ -8,7 +8,7 @@ import pytest
 from imud.fleet.broker import LOST, BrokerTurn, Will
 from imud.fleet.commands import CommandChannel, CommandReply
 from imud.fleet.messages import JSON_TYPE, MAGIC, SLOTS_TYPE
-from imud.fleet.sender import SKIP_NS, TOPICS_MAX, MqttSender, TopicRefusals
+from imud.fleet.sender import SKIP_NS, TOPICS_MAX, UNCLAIMED_NS, UNCLAIMED_SKIP_NS, MqttSender, TopicRefusals
 from imud.fleet.settings import Broker, CommandOptions, MqttOptions
 from imud.fleet.spool import SpoolRow
 from imud.fleet.streams import Gateway
@@ -337,3 +337,36 @@ def test_lost_connections_refuse_no_innocent_topic_and_a_silent_broker_is_left()
     bench.clock.advance(5 * NS_PER_S)
     bench.sender.work()
     assert bench.sender.problem == "mqtt://a:1: no acknowledgement of 1 messages within 60 s"
+
+
+def test_messages_stay_in_the_spool_for_five_minutes_after_the_last_subscriber() -> None:
+    bench, topic = SenderBench(), "data/x"
+    rows = [row(n, b"%d" % n, topic) for n in range(1, 6)]
+    bench.sender.retain({"state": b"1"})
+    bench.drive(5, rows[:2])
+    assert bench.done == {1, 2}
+    bench.broker.unclaimed = {topic, "state", "data/y"}
+    bench.sender.retain({"state": b"2"})
+    bench.sender.give(1, [*rows[2:], row(9, topic="data/y")])
+    bench.drive(5)
+    assert bench.done == {1, 2, 9}, "data/y never had a subscriber"
+    assert bench.sender.skipped == bench.sender.refused.keys() == {topic}
+    assert bench.sender.refused[topic].startswith("no client has a subscription of this topic any more")
+    assert bench.sender.held() == set(), "the writer reads the messages from the spool again"
+    for _ in range(3):
+        bench.clock.advance(UNCLAIMED_SKIP_NS)
+        bench.sender.work()
+        bench.sender.give(1, rows[2:])
+        bench.drive(2)
+        assert bench.done == {1, 2, 9}
+    bench.broker.unclaimed = set()
+    bench.clock.advance(UNCLAIMED_SKIP_NS)
+    bench.sender.work()
+    bench.sender.give(1, rows[2:4])
+    bench.drive(3)
+    assert (bench.done, bench.sender.refused, bench.sender.skipped) == ({1, 2, 3, 4, 9}, {}, frozenset())
+    bench.broker.unclaimed = {topic}
+    bench.clock.advance(UNCLAIMED_NS)
+    bench.sender.give(1, rows[4:])
+    bench.drive(2)
+    assert 5 in bench.done, "without a subscriber for a longer time, the broker may discard messages"
