@@ -153,7 +153,8 @@ SUBJECTS: Final[Mapping[str, Subject]] = {
                 "fleet_retention", "Retention",
                 "The table `imud_intervals` with 24 values per row and one partition or chunk per day, after different "
                 "numbers of days. The values are random, so that compression has little effect on them. Times are the "
-                "minimum of five calls, or of the calls in five seconds.",
+                "minimum of five calls, or of the calls in five seconds. The just-in-time compiler of PostgreSQL is "
+                "off.",
                 by_hand="python -m tests.bench.fleet_retention",
             ),
             Run(

@@ -2,7 +2,8 @@
 
 `python -m tests.bench.fleet_retention [--days 10 100 300]`. Each day has the same number of rows and one partition
 or chunk of TimescaleDB. The rows have 24 values of accelerometer and gyroscope. The values are random, so that
-compression has little effect on them. Times are the minimum of CALLS calls, or of the calls in CALLS_S.
+compression has little effect on them. Times are the minimum of CALLS calls, or of the calls in CALLS_S. The just-in-time
+compiler of PostgreSQL is off, because it takes longer than most queries of many partitions.
 """
 
 import argparse
@@ -141,7 +142,7 @@ def main() -> int:
             continue
         rows = []
         for days in args.days:
-            with running_server(engine.removeprefix("partitions")) as server:
+            with running_server(engine.removeprefix("partitions"), "-c jit=off") as server:
                 rows.append(measure(server.url, engine, days, args.rows_per_day))
             print(rows[-1], flush=True)
         tables.append(Table(engine, rows))
