@@ -19,7 +19,7 @@ from imud.fleet.database.tables import (
     REJECTED,
     Component,
 )
-from imud.fleet.database.views import DAYS, GATEWAY_STATUS, HOURS, STREAMS, aggregate
+from imud.fleet.database.views import DAYS_OF, GATEWAY_STATUS, HOURS_OF, STREAMS, aggregate
 from imud.fleet.messages import Stream
 from tests.support.files import ROOT
 
@@ -33,12 +33,13 @@ ROWS_MAX: Final = 1000
 """Maximum number of rows of a table."""
 TIME: Final = "$__timeGroupAlias(time, $__interval)"
 RANGE: Final = "$__timeTo()::timestamptz - $__timeFrom()::timestamptz"
+FROM_TO: Final = "$__timeFrom()::timestamptz, $__timeTo()::timestamptz"
 TABLES: Final = (
     (INTERVALS.name, "utc_set AND samples > 0", "0 s", "2 days"),
-    (HOURS, "true", "2 days", "90 days"),
-    (DAYS, "true", "90 days", "1000 years"),
+    (f"{HOURS_OF}({FROM_TO})", "true", "2 days", "90 days"),
+    (f"{DAYS_OF}({FROM_TO})", "true", "90 days", "1000 years"),
 )
-"""Tables with the statistics of a device: name, condition, shortest and longest time range."""
+"""Tables and functions with the statistics of a device: name, condition, shortest and longest time range."""
 UNITS: Final = {"m_s2": "accMS2", "rad_s": "rotrads", "rad": "radian", "t": "si:T", "c": "celsius"}
 """Units of Grafana by the end of the column name."""
 

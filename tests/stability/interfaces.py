@@ -392,8 +392,10 @@ UNIT: Final = re.compile(r", (ns since 1970|ns|ms|s|bytes|m/s²|rad/s|rad|m/s|m|
 
 def database() -> Facts:
     found = {f"{one.name}, primary key": ", ".join(one.primary) for one in TABLES if one.primary}
+    views = database_views(with_timescale=False)
+    found |= {f"{one.function}(since timestamptz, until timestamptz)": one.name for one in views if one.function}
     parts = [(one.name, one.columns) for one in TABLES]
-    parts += [(one.name, one.columns) for one in database_views(with_timescale=False)]
+    parts += [(one.name, one.columns) for one in views]
     return found | {f"{name}.{one.name}": _column_fact(one) for name, columns in parts for one in columns}
 
 

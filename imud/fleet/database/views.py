@@ -5,7 +5,9 @@
     imud_intervals ──▶ imud_intervals_1h ──▶ imud_intervals_1d
 
 With TimescaleDB, the last two are continuous aggregates: TimescaleDB stores finished hours and days, and computes newer
-rows when a program reads them. Otherwise, PostgreSQL computes all rows when a program reads them.
+rows when a program reads them. Otherwise, PostgreSQL computes all rows when a program reads them. It does not use a
+condition for the time of an hour to select partitions. Therefore, the functions `imud_hours` and `imud_days` return the
+same rows for a time range.
 
 Any client of the broker can write values into the tables. No value makes a view fail: sums have a maximum, and means
 ignore values with a product outside the range of double precision.
@@ -45,6 +47,8 @@ class FleetView(NamedTuple):
     values: tuple[ViewColumn, ...]
     source: str
     is_aggregate: bool = False  # True for a continuous aggregate of TimescaleDB
+    function: str = ""  # name of the function that returns the rows of a time range; empty without a function
+    range_source: str = ""  # source of the query of this function
 
     @property
     def columns(self) -> tuple[Column, ...]:
@@ -60,6 +64,15 @@ class FleetView(NamedTuple):
         else:
             yield f"CREATE VIEW {self.name} {query}"
         yield from comments("VIEW", self.name, self.comment, self.columns)
+        if self.function:
+            names = "*" if self.is_aggregate else selected
+            # PostgreSQL includes a stable SQL function in the query, and then reads only the partitions of the range
+            yield (
+                f"CREATE FUNCTION {self.function}(since timestamptz, until timestamptz) RETURNS SETOF {self.name} "
+                f"LANGUAGE sql STABLE PARALLEL SAFE AS $$ SELECT {names} {self.range_source} $$"
+            )
+            comment = f"rows of {self.name} that overlap the time range since <= time < until"
+            yield f"COMMENT ON FUNCTION {self.function} IS '{comment}'"
 
 
 def _kept(table: FleetTable, *names: str, source: str = "", comment: str = "") -> Iterator[ViewColumn]:
@@ -147,15 +160,23 @@ def _meaning(component: Component, measure: str) -> str:
     }.get(measure, "of the unwrapped angles of each interval, can be outside -π to π")
 
 
-def _intervals(name: str, width: str, source: str, *, with_timescale: bool) -> FleetView:
-    """Return the view with statistics in steps of `width`. `source`: table or view, and the conditions."""
-    # both functions align the times to UTC
-    bucket = (
-        f"time_bucket(interval '{width}', time)"
-        if with_timescale
-        else f"date_bin(interval '{width}', time, timestamptz '2000-01-01 00:00+00')"
-    )
+def _intervals(
+    name: str, width: str, source: str, function: str, range_source: str, *, with_timescale: bool
+) -> FleetView:
+    """Return the view with statistics in steps of `width`. `source`: table or view, and the conditions. `range_source`:
+    the same for the function, with `{low}` and `{high}`, the first time of the range and the first time after it."""
+
+    def bucket_of(time: str) -> str:
+        # both functions align the times to UTC
+        if with_timescale:
+            return f"time_bucket(interval '{width}', {time})"
+        return f"date_bin(interval '{width}', {time}, timestamptz '2000-01-01 00:00+00')"
+
+    bucket = bucket_of("time")
+    low = bucket_of("since")
+    high = bucket_of("until - interval '1 microsecond'") + f" + interval '{width}'"
     keys = tuple(_kept(INTERVALS, "site", "gateway", "device", "stream"))
+    group = f"GROUP BY {bucket}, {', '.join(one.expression for one in keys)}"
     return FleetView(
         name,
         f"statistics of each device in {width}, weighted by the samples of the intervals; only rows with a known time",
@@ -171,24 +192,30 @@ def _intervals(name: str, width: str, source: str, *, with_timescale: bool) -> F
                 for measure in MEASURES
             ),
         ),
-        f"FROM {source} GROUP BY {bucket}, {', '.join(one.expression for one in keys)}",
+        f"FROM {source} {group}",
         with_timescale,
+        function,
+        f"FROM {name} WHERE time >= {low} AND time < {high}"
+        if with_timescale
+        else f"FROM {range_source.format(low=low, high=high)} {group}",
     )
 
 
 HOURS: Final = "imud_intervals_1h"
 DAYS: Final = "imud_intervals_1d"
+HOURS_OF: Final = "imud_hours"
+DAYS_OF: Final = "imud_days"
 
 
 def views(*, with_timescale: bool) -> tuple[FleetView, ...]:
     """Return all views, each after the views that it reads."""
-    known = f"{INTERVALS.name} WHERE utc_set AND samples > 0"
+    known, in_range = f"{INTERVALS.name} WHERE utc_set AND samples > 0", "time >= {low} AND time < {high}"
     return (
         STREAMS,
         GATEWAY_STATUS,
-        _intervals(HOURS, "1 hour", known, with_timescale=with_timescale),
+        _intervals(HOURS, "1 hour", known, HOURS_OF, f"{known} AND {in_range}", with_timescale=with_timescale),
         # a late interval changes a complete day: 24 rows per device instead of 86,400 intervals at 1 Hz
-        _intervals(DAYS, "1 day", HOURS, with_timescale=with_timescale),
+        _intervals(DAYS, "1 day", HOURS, DAYS_OF, HOURS_OF + "({low}, {high})", with_timescale=with_timescale),
     )
 
 

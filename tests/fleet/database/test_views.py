@@ -142,6 +142,44 @@ def test_hours_and_days_have_weighted_statistics(cursor: Any) -> None:
     assert second == pytest.approx((0.1 - math.pi, 0.4 - math.pi, math.pi - 0.2))
 
 
+def test_functions_return_the_hours_and_days_of_a_range(cursor: Any) -> None:
+    for day in (1, 2, 3, 4):
+        for hour in (0, 12, 23):
+            insert(cursor, INTERVALS, time=f"2026-01-0{day} {hour}:00:01+00", accel_x_mean_m_s2=day + hour)
+    names = "time, site, gateway, device, stream, samples, accel_x_mean_m_s2"
+    for function, view, since, until, count in (
+        ("imud_hours", HOURS, "2026-01-02 12:59", "2026-01-03 12:00", 3),  # 12:00 and 23:00, and 0:00
+        ("imud_hours", HOURS, "2026-01-02 12:59", "2026-01-03 12:00:00.000001", 4),
+        ("imud_days", DAYS, "2026-01-02 23:59", "2026-01-04 00:00", 2),
+        ("imud_days", DAYS, "2026-01-02 23:59", "2026-01-04 00:01", 3),
+        ("imud_hours", HOURS, "0001-01-01", "9999-01-01", 12),
+        ("imud_days", DAYS, "2026-01-03", "2026-01-02", 0),
+    ):
+        values = {"since": f"{since}+00", "until": f"{until}+00"}
+        cursor.execute(f"SELECT {names} FROM {function}(%(since)s, %(until)s) ORDER BY time", values)
+        found = cursor.fetchall()
+        width = view.removeprefix("imud_intervals_")
+        cursor.execute(
+            f"SELECT {names} FROM {view} WHERE time > %(since)s::timestamptz - interval '{width}' "
+            "AND time < %(until)s ORDER BY time", values,
+        )  # fmt: skip
+        assert found == cursor.fetchall()
+        assert len(found) == count, function
+
+
+@pytest.mark.parametrize("server", ["postgresql"], indirect=True)
+@pytest.mark.parametrize("function", ["imud_hours", "imud_days"])
+def test_functions_read_only_the_partitions_of_their_range(cursor: Any, function: str) -> None:
+    for day in range(1, 5):
+        cursor.execute(
+            f"CREATE TABLE old_{day} PARTITION OF imud_intervals_set FOR VALUES FROM ('2020-01-0{day} 00:00+00') "
+            f"TO ('2020-01-0{day + 1} 00:00+00')"
+        )
+    cursor.execute(f"EXPLAIN SELECT samples FROM {function}('2020-01-02 10:00+00', '2020-01-03 11:00+00')")
+    plan = "\n".join(line for (line,) in cursor)
+    assert [day for day in range(1, 5) if f"old_{day}" in plan] == [2, 3]
+
+
 @pytest.mark.parametrize("value", [1.7e308, -1.7e308, 5e-324, math.inf, math.nan])
 def test_false_values_do_not_make_a_view_fail(cursor: Any, value: float) -> None:
     """Any client of the broker can send such values."""
