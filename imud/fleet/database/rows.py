@@ -20,7 +20,7 @@ from imud.fleet.reader import FleetBatch
 from imud.fleet.statistics import MEASURES, SCALARS, VECTORS
 from imud.model.sample import SAMPLE_FIELDS, values_of
 
-Row = tuple[object, ...]
+Row = tuple[Any, ...]
 Names = tuple[str, ...]
 
 _EPOCH_US: Final = 946_684_800_000_000  # 2000-01-01, start of the time scale of PostgreSQL, µs since 1970
@@ -40,6 +40,8 @@ _INTERVAL_COLUMNS: Final = {
 _POSITION_COLUMNS: Final = ("latitude_rad", "longitude_rad", "height_m", "position_quality", "satellites")
 _HEAD: Final = ("site", "gateway", "boot", "device")
 _CLOCK: Final = ("time", "utc_ns", "utc_set", "utc_err_ns")
+_TIME_AT: Final = len(_HEAD)  # index of `time` in each row, µs since 2000
+_DAY_US: Final = 86_400 * 1_000_000
 _ALWAYS: Final = ("seq", "t_ns", "t_err_ns", "sync", "t_rx_ns")
 _OPTIONAL: Final = tuple(
     name for name in SAMPLE_FIELDS if name in SAMPLES.names and name not in (*_HEAD, *_CLOCK, *_ALWAYS, *SCALARS)
@@ -71,6 +73,11 @@ class TableRows:
     def names(self) -> Names:
         """Return the columns of all rows."""
         return tuple(dict.fromkeys(chain.from_iterable(self._rows)))
+
+    @property
+    def days(self) -> set[int]:
+        """Return the days of the rows, since 2000-01-01."""
+        return {row[_TIME_AT] // _DAY_US for row in chain.from_iterable(self._rows.values())}
 
     def copy(self, cursor: Any, target: str) -> None:
         """Copy the rows into `target`, a table with the columns of `table`. Do nothing without rows."""

@@ -37,6 +37,10 @@ from imud.fleet.reader import FleetBatch
 
 Offsets = Mapping[BootKey, BootOffset]
 
+# Maximum number of days of the rows in a transaction. TimescaleDB creates a chunk for each day, and needs several locks
+# for it. The spool of a gateway usually has at most seven days.
+DAYS_MAX: Final = 100
+
 
 class DecodedDelivery(NamedTuple):
     """Message of the broker with its content."""
@@ -196,6 +200,11 @@ class FleetTransaction:
         self._lock_boots()
         ledgers = self._lock_ledgers()
         rows = self._take(ledgers)
+        days = len(set[int]().union(*(one.days for one in rows.tables)))
+        if days > DAYS_MAX:
+            raise ValueError(
+                f"expected records of at most {DAYS_MAX} different days, got {days}; is the clock of the gateway wrong?"
+            )
         for one in rows.tables:
             if one.count:
                 insert(self._cursor, one)

@@ -14,11 +14,12 @@ import pytest
 from imud.fleet import messages as fleet_messages
 from imud.fleet.accounts import GatewayState
 from imud.fleet.database.store import PostgresStore
-from imud.fleet.messages import MessageKind
+from imud.fleet.messages import FleetMessage, MessageKind
 from imud.fleet.statistics import SCALARS, VECTORS
 from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
 from imud.model.sample import Sample, Sync
+from imud.model.units import NS_PER_S
 from tests.fleet.database.deliveries import BALANCE, deliveries, delivery, delivery_of, ledgers, write
 from tests.fleet.fleet_gateway import (
     UTC_NS,
@@ -212,6 +213,26 @@ def test_messages_that_cannot_be_stored_are_rejected(database: str) -> None:
         ("imud/mill/gw/bow/statistics", len(delivery_of(strange[0]).payload), "expected values of " + FIELDS),
     ]  # fmt: skip
     assert [bytes(row[2]) for row in found[2:4]] == [b"x" * 4096, b"{}"]
+
+
+def test_the_days_of_a_transaction_are_limited(database: str) -> None:
+    """A message of a false sender with thousands of days would need more locks than PostgreSQL has."""
+
+    def over_days(first: int, days: int) -> FleetMessage:
+        made = samples_message(first, first + days - 1)
+        samples = [
+            msgspec.structs.replace(one, utc_ns=one.utc_ns - day * 86_400 * NS_PER_S)
+            for day, one in enumerate(made.samples)
+        ]
+        return msgspec.structs.replace(made, samples=samples)
+
+    with closing(PostgresStore(database)) as store:
+        # 120 days in one transaction become two transactions
+        store.write(deliveries(over_days(1, 100), over_days(101, 120), over_days(221, 20)))
+        assert (store.counts.rows, store.counts.rejected) == (120, 1)
+    ((reason,),) = query(database, "SELECT reason FROM imud_rejected")
+    assert reason.startswith("expected records of at most 100 different days, got 120;")
+    assert ledgers(database, f"newest, whole, missing, gaps, {BALANCE}") == [(240, 120, 120, [101, 220], 0)]
 
 
 def test_the_number_of_rejected_messages_is_limited(database: str) -> None:
