@@ -370,3 +370,16 @@ def test_messages_stay_in_the_spool_for_five_minutes_after_the_last_subscriber()
     bench.sender.give(1, rows[4:])
     bench.drive(2)
     assert 5 in bench.done, "without a subscriber for a longer time, the broker may discard messages"
+
+
+def test_the_number_of_topics_with_a_subscriber_is_limited() -> None:
+    bench = SenderBench()
+    bench.drive(1)
+    for number in range(TOPICS_MAX + 1):
+        bench.sender.give(1, [row(number + 1, topic=f"data/{number}")])
+        bench.drive(1)
+    bench.broker.unclaimed = {"data/0", "data/1"}
+    bench.sender.give(1, [row(1001, topic="data/0"), row(1002, topic="data/1")])
+    bench.drive(2)
+    assert bench.sender.refused.keys() == {"data/1"}, "imud has forgotten the oldest topic"
+    assert bench.done >= {1001}
