@@ -221,7 +221,7 @@ def conditions_of(run: Run, results: Results) -> Row:
     return {
         "measurement": run.title, "start, UTC": results.begun, "duration, s": results.seconds,
         "commit": f"`{results.commit}`", "host": results.host, "Python": results.python, "kernel": results.kernel,
-        "load at the start": results.load,
+        "C kernel": results.c_kernel, "load at the start": results.load,
     }  # fmt: skip
 
 

@@ -13,6 +13,8 @@ from typing import Any, Final
 
 import msgspec
 
+from imud.formats import kernel
+
 ROOT: Final = Path(__file__).parents[2]
 UNKNOWN: Final = "unknown"
 
@@ -38,6 +40,7 @@ class Results(msgspec.Struct, frozen=True):
     load: float  # load average of one minute at the start
     tables: list[Table]
     problems: list[str] = []  # exceeded limits, goals that were not reached, findings
+    c_kernel: str = UNKNOWN  # use of the C kernel by imud: active, or the reason why not
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:
@@ -72,6 +75,9 @@ class ProgramRun:
 
     def __init__(self) -> None:
         self._begun, self._load = datetime.now(UTC), os.getloadavg()[0]
+        self._c_kernel = f"not active: {kernel.present.problem}" if kernel.present.problem else "active"
+        if kernel.present.problem:
+            print(f"C kernel {self._c_kernel}", file=sys.stderr)
 
     def save(self, file: Path | None, tables: Iterable[Table], problems: Sequence[str] = ()) -> None:
         """Write the results to a file; do nothing without a file."""
@@ -82,6 +88,7 @@ class ProgramRun:
             commit(), f"{os.cpu_count()} × {platform.machine()}",
             f"{platform.python_implementation()} {platform.python_version()}",
             f"{platform.system()} {platform.release()}", round(self._load, 1), list(tables), list(problems),
+            self._c_kernel,
         )  # fmt: skip
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(encode(results))
