@@ -55,10 +55,11 @@ SKIP_NS: Final = 60 * NS_PER_S
 SKIP_MOST_NS: Final = 3600 * NS_PER_S
 # Maximum number of refused topics, of suspected topics, and of topics with a subscriber. imud forgets the oldest.
 TOPICS_MAX: Final = 500
-# Time for which imud keeps messages without a subscriber, if their topic had a subscriber before, ns. After a restart,
-# a broker can have no subscription until the collectors connect again.
+# Time for which imud keeps messages without a subscriber if their topic had a subscriber before, ns. After a restart, a
+# broker can have no subscription until the collectors connect again.
 UNCLAIMED_NS: Final = 300 * NS_PER_S
 UNCLAIMED_SKIP_NS: Final = 10 * NS_PER_S  # time between two tests of such a topic, ns
+RIGHTS: Final = "; check the access rights of the gateway"
 
 
 def is_subscription(topic: str) -> bool:
@@ -138,7 +139,7 @@ class TopicRefusals:
             self._suspects[topic] = losses
             if losses >= LOSSES_MAX:
                 packet = "the subscription" if is_subscription(topic) else "a message"
-                self.refuse(topic, f"{problem}, {losses} times after {packet} of this topic", now_ns)
+                self.refuse(topic, f"{problem}, {losses} times after {packet} of this topic{RIGHTS}", now_ns)
         while len(self._suspects) > TOPICS_MAX:
             del self._suspects[next(iter(self._suspects))]
 
@@ -195,8 +196,8 @@ class MqttSender:
         self._unanswered = ""  # `problem` of missing acknowledgements
         self._has_answer = False  # whether an acknowledgement arrived after `_unanswered`
         self._refusals = TopicRefusals()
-        # time of the newest acknowledgement of a message that had a subscriber, by topic
-        self._claimed_ns: dict[str, int] = {}
+        # topics that had a subscriber, with the time of the first message without a subscriber after that
+        self._claimed: dict[str, int | None] = {}
         self._answers: list[tuple[int, int]] = []
         self._retained: dict[str, bytes] = {}  # newest payload by topic
         self._due: dict[str, None] = {}  # topics of retained messages to send, in order
@@ -416,7 +417,7 @@ class MqttSender:
                 message = self._in_flight.pop(number, None)
             if message is not None:
                 self.replies_lost += message.reply is not None
-                self._refuse(message.topic, f"{problem}; check the access rights of the gateway")
+                self._refuse(message.topic, problem + RIGHTS)
         if not connection.acknowledged:
             return
         numbers, connection.acknowledged = connection.acknowledged, []
@@ -466,19 +467,25 @@ class MqttSender:
     # --- refused topics -----------------------------------------------------------------------------------------------
 
     def _is_kept(self, number: int, *, is_claimed: bool) -> bool:
-        """Return whether an acknowledged message stays in the spool: it had no subscriber, but its topic had one in the
-        last UNCLAIMED_NS. imud sends this message again."""
+        """Return whether an acknowledged message stays in the spool, so that imud sends it again. This is true for
+        UNCLAIMED_NS after the first message without a subscriber, if the topic had a subscriber before."""
         message = self._in_flight.get(number)
         if message is None or not message.row:
             return False
         topic, now_ns = message.topic, self._now_ns()
         if is_claimed:
-            self._claimed_ns.pop(topic, None)
-            self._claimed_ns[topic] = now_ns
-            if len(self._claimed_ns) > TOPICS_MAX:
-                del self._claimed_ns[next(iter(self._claimed_ns))]
+            self._claimed.pop(topic, None)
+            self._claimed[topic] = None
+            if len(self._claimed) > TOPICS_MAX:
+                del self._claimed[next(iter(self._claimed))]
             return False
-        if topic not in self._claimed_ns or now_ns - self._claimed_ns[topic] > UNCLAIMED_NS:
+        if topic not in self._claimed:
+            return False
+        begin_ns = self._claimed[topic]
+        if begin_ns is None:
+            begin_ns = self._claimed[topic] = now_ns
+        if now_ns - begin_ns > UNCLAIMED_NS:
+            del self._claimed[topic]
             return False
         with self._lock:
             del self._in_flight[number]
