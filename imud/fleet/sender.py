@@ -152,6 +152,34 @@ class TopicRefusals:
         return ended
 
 
+class TopicSubscribers:
+    """Topics that had a subscriber since the start. Synchronization: one thread."""
+
+    def __init__(self) -> None:
+        # with the time of the first message without a subscriber after that
+        self._topics: dict[str, int | None] = {}
+
+    def note(self, topic: str) -> None:
+        """Store that a message of the topic had a subscriber."""
+        self._topics.pop(topic, None)
+        self._topics[topic] = None
+        if len(self._topics) > TOPICS_MAX:
+            del self._topics[next(iter(self._topics))]
+
+    def are_expected(self, topic: str, now_ns: int) -> bool:
+        """Return whether imud keeps a message without a subscriber: for UNCLAIMED_NS after the first one, if the topic
+        had a subscriber before."""
+        if topic not in self._topics:
+            return False
+        begin_ns = self._topics[topic]
+        if begin_ns is None:
+            begin_ns = self._topics[topic] = now_ns
+        if now_ns - begin_ns > UNCLAIMED_NS:
+            del self._topics[topic]
+            return False
+        return True
+
+
 class _Message(NamedTuple):
     """Message or subscription that the sender sends next, or that is in flight."""
 
@@ -196,8 +224,7 @@ class MqttSender:
         self._unanswered = ""  # `problem` of missing acknowledgements
         self._has_answer = False  # whether an acknowledgement arrived after `_unanswered`
         self._refusals = TopicRefusals()
-        # topics that had a subscriber, with the time of the first message without a subscriber after that
-        self._claimed: dict[str, int | None] = {}
+        self._subscribers = TopicSubscribers()
         self._answers: list[tuple[int, int]] = []
         self._retained: dict[str, bytes] = {}  # newest payload by topic
         self._due: dict[str, None] = {}  # topics of retained messages to send, in order
@@ -467,25 +494,14 @@ class MqttSender:
     # --- refused topics -----------------------------------------------------------------------------------------------
 
     def _is_kept(self, number: int, *, is_claimed: bool) -> bool:
-        """Return whether an acknowledged message stays in the spool, so that imud sends it again. This is true for
-        UNCLAIMED_NS after the first message without a subscriber, if the topic had a subscriber before."""
+        """Return whether an acknowledged message stays in the spool, so that imud sends it again."""
         message = self._in_flight.get(number)
         if message is None or not message.row:
             return False
-        topic, now_ns = message.topic, self._now_ns()
         if is_claimed:
-            self._claimed.pop(topic, None)
-            self._claimed[topic] = None
-            if len(self._claimed) > TOPICS_MAX:
-                del self._claimed[next(iter(self._claimed))]
+            self._subscribers.note(message.topic)
             return False
-        if topic not in self._claimed:
-            return False
-        begin_ns = self._claimed[topic]
-        if begin_ns is None:
-            begin_ns = self._claimed[topic] = now_ns
-        if now_ns - begin_ns > UNCLAIMED_NS:
-            del self._claimed[topic]
+        if not self._subscribers.are_expected(message.topic, self._now_ns()):
             return False
         with self._lock:
             del self._in_flight[number]
@@ -493,7 +509,7 @@ class MqttSender:
             "no client has a subscription of this topic any more; imud keeps the messages for at most "
             f"{UNCLAIMED_NS // NS_PER_S} s: does a collector run?"
         )
-        self._refuse(topic, problem, UNCLAIMED_SKIP_NS)
+        self._refuse(message.topic, problem, UNCLAIMED_SKIP_NS)
         return True
 
     def _refuse(self, topic: str, problem: str, skip_ns: int | None = None) -> None:
