@@ -138,13 +138,13 @@ def main() -> int:
         print(NO_POSTGRES)
         return 1
     tables = []
-    for engine, reason in (("partitions", ""), ("timescaledb", NO_TIMESCALE)):
+    for engine, library, reason in (("partitions", "", ""), ("timescaledb", "timescaledb", NO_TIMESCALE)):
         if reason:
             print(f"{engine}: not measured: {reason}")
             continue
         rows = []
         for days in args.days:
-            with running_server(engine.removeprefix("partitions"), "-c jit=off") as server:
+            with running_server(library, "-c jit=off") as server:
                 rows.append(measure(server.url, engine, days, args.rows_per_day))
             print(rows[-1], flush=True)
         tables.append(Table(engine, rows))
