@@ -52,6 +52,10 @@ class _Use:
         self.cpu_ns = min(cpu_per_s, self.cpu_ns + elapsed_s * cpu_per_s)
         self.replies = min(replies_per_s, self.replies + elapsed_s * replies_per_s)
 
+    def charge(self, spent_ns: int) -> None:
+        """Subtract CPU time. The debt is at most the budget of one second, so that a flood ends with its sender."""
+        self.cpu_ns = max(self.cpu_ns - spent_ns, -float(self._limits.second_cpu_ns * self._scale))
+
     @property
     def is_full(self) -> bool:
         """Whether the whole budget of one second is available: the state of a peer without work."""
@@ -114,6 +118,16 @@ class WorkBudget:
         self._refuse(peer)
         return False
 
+    @property
+    def is_turn_over(self) -> bool:
+        """Whether the CPU time of the turn is spent: leave further inputs in the queue of the kernel."""
+        return self._mark_ns >= self._turn_end_ns
+
+    @property
+    def is_spent(self) -> bool:
+        """Whether all peers together have spent the budget of the edge: do not read inputs until later."""
+        return self._edge.cpu_ns <= 0
+
     def problem(self, now_ns: int) -> str:
         """Return a sentence that names the peer of the last refusal; empty if it is older than 10 s."""
         if self._refused_ns is None or now_ns - self._refused_ns > SHOWN_NS:
@@ -126,8 +140,8 @@ class WorkBudget:
         cpu_ns = self._cpu_ns()
         if self._working is not None:
             spent_ns = cpu_ns - self._mark_ns
-            self._working.cpu_ns -= spent_ns
-            self._edge.cpu_ns -= spent_ns
+            self._working.charge(spent_ns)
+            self._edge.charge(spent_ns)
         self._mark_ns = cpu_ns
 
     def _use(self, peer: Hashable) -> _Use:

@@ -111,3 +111,26 @@ def test_clock_that_steps_back_adds_nothing(budget: WorkBudget, cpu: Cpu) -> Non
     work(budget, cpu, "a", 2000, 1)
     budget.start_turn(0)
     assert not budget.admit("a")
+
+
+def test_turn_is_over_after_its_cpu_time(budget: WorkBudget, cpu: Cpu) -> None:
+    budget.start_turn(0)
+    assert not budget.is_turn_over
+    work(budget, cpu, "a", 600, 3)
+    assert budget.is_turn_over
+    budget.start_turn(0)
+    assert not budget.is_turn_over
+
+
+def test_debt_of_a_peer_is_one_second(budget: WorkBudget, cpu: Cpu) -> None:
+    """A flood costs CPU time although the budget refuses it. The peer can work again one second after the flood."""
+    for _ in range(100):
+        budget.start_turn(0)
+        work(budget, cpu, "a", 1000, 1)
+        budget.admit("a")
+        cpu.time_ns += 1000  # cost of reading refused input
+        budget.end_turn()
+    assert budget.is_spent
+    budget.start_turn(NS_PER_S * 11 // 10)
+    assert not budget.is_spent
+    assert budget.admit("a")
