@@ -19,11 +19,12 @@ constant, so that an encoder needs one call of `struct` per message (measured: 1
 import re
 import struct
 from collections.abc import Callable, Sequence
-from math import degrees, isfinite, nan
+from math import degrees, hypot, inf, isfinite, nan
 from struct import Struct
 from typing import Any, Final
 
-from imud.attitude.conventions import is_settled
+from imud.attitude.conventions import Convention, is_settled
+from imud.attitude.rotation import matrix_from_quat, matrix_times
 from imud.bridges.channel import (
     STEADY_NS,
     Diagnoses,
@@ -38,7 +39,7 @@ from imud.bridges.channel import (
     topic,
 )
 from imud.formats.slot import SYNC_CODES
-from imud.model.sample import Sample, Sync
+from imud.model.sample import Quaternion, Sample, Sync, Vector3
 from imud.model.units import NS_PER_S
 
 ENCAPSULATION: Final = b"\x00\x01\x00\x00"  # encapsulation header: CDR_LE, no options
@@ -136,7 +137,8 @@ FIELDS: Final = {
         "std_msgs/Header header\ngeometry_msgs/Vector3 magnetic_field\nfloat64[9] magnetic_field_covariance"
     ),
     "sensor_msgs/NavSatStatus": (
-        "int8 STATUS_NO_FIX=-1\nint8 STATUS_FIX=0\nint8 status\nuint16 SERVICE_GPS=1\nuint16 service"
+        "int8 STATUS_NO_FIX=-1\nint8 STATUS_FIX=0\nint8 STATUS_SBAS_FIX=1\nint8 STATUS_GBAS_FIX=2\nint8 status\n"
+        "uint16 SERVICE_GPS=1\nuint16 service"
     ),
     "sensor_msgs/NavSatFix": (
         "std_msgs/Header header\nsensor_msgs/NavSatStatus status\nfloat64 latitude\nfloat64 longitude\n"
@@ -206,6 +208,10 @@ def _parts_of(name: str) -> list[str]:
     return [word for word in words if word in FIELDS]
 
 
+NO_FIX, FIX, SBAS_FIX, GBAS_FIX = -1, 0, 1, 2  # `status` of sensor_msgs/NavSatStatus
+# Status by the quality of a position. ROS has no status for a position that is not measured with satellites: dead
+# reckoning (6), manual (7) and simulation (8) have NO_FIX. RTK, float and fixed, uses a station on the ground.
+FIX_STATUS: Final = {0: NO_FIX, 1: FIX, 2: SBAS_FIX, 3: FIX, 4: GBAS_FIX, 5: GBAS_FIX, 6: NO_FIX, 7: NO_FIX, 8: NO_FIX}
 LEVEL_INFO: Final = 20
 LEVEL_WARN: Final = 30
 SEC_MAX: Final = 0x7FFF_FFFF  # maximum `sec` of `builtin_interfaces/Time`, in the year 2038
@@ -239,7 +245,7 @@ class Ros2Dialect:
             ),
             ("/tf", "tf2_msgs/TFMessage", _transform(frames), {"quat_wxyz"}),
             (topic(name, "fix"), "sensor_msgs/NavSatFix", _fix(frames), {"position"}),
-            (topic(name, "velocity"), "geometry_msgs/TwistStamped", _velocity(), {"velocity_enu_m_s"}),
+            (topic(name, "velocity"), "geometry_msgs/TwistStamped", _velocity(frames), {"velocity_enu_m_s"}),
             (topic(name, "stamp"), "imud_msgs/SampleStamp", _stamp(frames), _STAMP),
         )  # fmt: skip
         return [
@@ -384,8 +390,8 @@ def _fix(frames: MessageFrames) -> Encoder:
         place = sample.position
         if place is None:
             return None
-        # STATUS_NO_FIX, STATUS_FIX; SERVICE_GPS: the device does not send the systems of its satellites
-        status = -1 if place.quality == 0 else 0
+        # SERVICE_GPS: the device does not send the systems of its satellites
+        status = FIX if place.quality is None else FIX_STATUS.get(place.quality, NO_FIX)
         altitude = nan if place.height_m is None else place.height_m
         sec, nanosec = time_of(sample.utc_ns)
         return pack(
@@ -396,7 +402,10 @@ def _fix(frames: MessageFrames) -> Encoder:
     return encode
 
 
-def _velocity() -> Encoder:
+def _velocity(frames: MessageFrames) -> Encoder:
+    """Return the encoder of the velocity. Its angular part is the angular rate in the same frame (geometry_msgs/Twist);
+    zero without a settled attitude from north, as GNSS drivers of ROS send. A Twist cannot contain "unknown", and
+    consumers integrate or filter NaN."""
     layout = Layout("iI", f'"{EAST_NORTH_UP}', "6d")
     pack, (enu,) = layout.pack, layout.texts
 
@@ -405,9 +414,20 @@ def _velocity() -> Encoder:
         if velocity is None:
             return None
         sec, nanosec = time_of(sample.utc_ns)
-        return pack(ENCAPSULATION, sec, nanosec, enu, *velocity, nan, nan, nan)
+        rate = _NO_VECTOR
+        if frames.has_north and is_settled(sample.status):
+            rate = _rate_enu(sample.gyro_rad_s, sample.quat_wxyz, frames.convention)
+        return pack(ENCAPSULATION, sec, nanosec, enu, *velocity, *rate)
 
     return encode
+
+
+def _rate_enu(gyro: Vector3 | None, quat: Quaternion | None, convention: Convention) -> Vector3:
+    """Return the angular rate about east, north and up; zeros if it is unknown."""
+    if gyro is None or quat is None or not isfinite(sum(gyro)) or not 0.0 < hypot(*quat) < inf:
+        return _NO_VECTOR
+    x, y, z = matrix_times(matrix_from_quat(quat), gyro)
+    return (y, x, -z) if convention is Convention.NED_FRD else (x, y, z)
 
 
 def _stamp(frames: MessageFrames) -> Encoder:

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from imud.attitude.conventions import UNSETTLED_BIT
+from imud.attitude.conventions import UNSETTLED_BIT, Convention
 from imud.bridges import channel as bridge
 from imud.bridges.channel import MessageChannel, MessageFrames, StampedEvent
 from imud.bridges.ros2 import ENCAPSULATION, FIELDS, CdrWriter, Layout, Ros2Dialect, schema, time_of
@@ -97,12 +97,12 @@ def test_transform_stamp_and_alignment() -> None:
     fix, velocity = channels()["/bow/fix"], channels()["/bow/velocity"]
     place = read(fix, FULL)
     assert (place.latitude, place.longitude, place.altitude) == (math.degrees(0.5), math.degrees(-1.25), 42.5)
-    assert (place.status.status, place.status.service, place.position_covariance_type) == (0, 1, 0)
+    assert (place.status.status, place.status.service, place.position_covariance_type) == (2, 1, 0)
     invalid = read(fix, msgspec.structs.replace(FULL, position=Position(0.5, -1.25, quality=0)))
     assert (invalid.status.status, math.isnan(invalid.altitude)) == (-1, True)
     twist = read(velocity, FULL)
     assert (twist.header.frame_id, xyz(twist.twist.linear)) == ("enu", (1.5, -2.5, 0.25))
-    assert all(map(math.isnan, xyz(twist.twist.angular)))
+    assert xyz(twist.twist.angular) == (-0.5, 0.75, 0.25), "angular rate about east, north and up"
     assert (fix.encode(BARE), velocity.encode(BARE)) == (None, None)
     for length in range(1, 9):
         name = "abcdefgh"[:length]
@@ -115,6 +115,45 @@ def test_transform_stamp_and_alignment() -> None:
                 assert header.frame_id == own.get(where, name)
                 again = ROS.serialize_cdr(message, channel.schema.name)
                 assert bytes(again) == data, where
+
+
+@pytest.mark.parametrize(
+    ("quality", "status"),
+    [(None, 0), (0, -1), (1, 0), (2, 1), (3, 0), (4, 2), (5, 2), (6, -1), (7, -1), (8, -1), (9, -1), (254, -1)],
+)
+def test_fix_status(quality: int | None, status: int) -> None:
+    """sensor_msgs/NavSatStatus: NO_FIX -1, FIX 0, SBAS_FIX 1, GBAS_FIX 2. Dead reckoning (6), manual (7) and simulation
+    (8) are not fixes of satellites."""
+    sample = msgspec.structs.replace(FULL, position=Position(0.5, -1.25, quality=quality))
+    fix = read(channels()["/bow/fix"], sample)
+    assert fix.status.status == status
+
+
+def angular(sample: Sample, frames: MessageFrames = BOW) -> tuple[float, float, float]:
+    return xyz(read(channels(frames)["/bow/velocity"], sample).twist.angular)
+
+
+def test_angular_velocity() -> None:
+    """A yaw of 90 degrees: the x axis points to the north. The rate about the axes of the body is the rate about north,
+    west and up; in ned-frd about north, east and down, which is the same rotation."""
+    half = math.sqrt(0.5)
+    north = msgspec.structs.replace(FULL, quat_wxyz=(half, 0.0, 0.0, half), gyro_rad_s=(0.25, 0.5, -0.75))
+    assert angular(north) == pytest.approx((-0.5, 0.25, -0.75))
+    ned = msgspec.structs.replace(FULL, quat_wxyz=(1.0, 0.0, 0.0, 0.0), gyro_rad_s=(0.25, -0.5, 0.75))
+    assert angular(ned, MessageFrames("bow", Convention.NED_FRD)) == pytest.approx((-0.5, 0.25, -0.75))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"gyro_rad_s": None}, {"gyro_rad_s": (0.0, math.nan, 0.0)}, {"quat_wxyz": None}, {"quat_wxyz": (0.0,) * 4},
+        {"quat_wxyz": (math.nan, 0.0, 0.0, 1.0)}, {"status": 1 << UNSETTLED_BIT},
+    ],
+)  # fmt: skip
+def test_angular_velocity_is_zero_if_unknown(changes: dict[str, Any]) -> None:
+    """Consumers of a Twist cannot use NaN. Drivers of GNSS receivers send zero."""
+    assert angular(msgspec.structs.replace(FULL, **changes)) == (0.0, 0.0, 0.0)
+    assert angular(FULL, MessageFrames("bow", has_north=False)) == (0.0, 0.0, 0.0)
 
 
 def test_losses_events_and_diagnoses() -> None:
