@@ -55,10 +55,16 @@ SHARED: Final = 0  # ownership
 DISPOSED_UNREGISTERED: Final = b"\0\0\0\x03"  # status: the object is disposed and unregistered
 INFINITE_S: Final = 0x7FFF_FFFF
 DEFAULT_LEASE_S: Final = 100  # lease of a participant that does not send it (section 9.6.3.1)
-BITS_MAX: Final = 256  # maximum number of sequence numbers in an ACKNACK
+BITS_MAX: Final = 256  # maximum number of sequence numbers in an ACKNACK or a GAP (section 9.4.2.6)
+
+# Limits of received messages. They bound the work for one submessage and the stored state.
+SEQ_MAX: Final = 1 << 62  # maximum sequence number: half of the range, so that no sum leaves the range of 64 bits
+PARAMETERS_MAX: Final = 256  # maximum number of parameters in one list; Fast DDS sends about 40
+LOCATORS_MAX: Final = 16  # maximum number of addresses of one kind; a host has one for each network interface
+TEXT_BYTES_MAX: Final = 256  # maximum length of a topic or type; ROS 2 permits 255 characters
 
 _TS, _DATA = Struct("<BBHiI"), Struct("<BBHHH4s4siI")
-_HEARTBEAT, _GAP = Struct("<BBH4s4siIiIi"), Struct("<BBH4s4siIiII")
+_HEARTBEAT: Final = Struct("<BBH4s4siIiIi")
 _LOW_MASK: Final = 0xFFFF_FFFF  # low half of a sequence number
 
 
@@ -104,22 +110,27 @@ def heartbeat(
     )  # fmt: skip
 
 
-def gap(writer: bytes, reader: bytes, seq: int) -> bytes:
-    """Return the statement that a sequence number is not available."""
-    end = seq + 1
-    return _GAP.pack(GAP, 1, 28, reader, writer, seq >> 32, seq & _LOW_MASK, end >> 32, end & _LOW_MASK, 0)
+def gap(writer: bytes, reader: bytes, numbers: Sequence[int]) -> bytes:
+    """Return the statement that these sequence numbers are not available: at least one, in ascending order, in a range
+    of at most BITS_MAX numbers."""
+    start = numbers[0]
+    body = struct.pack("<4s4siI", reader, writer, start >> 32, start & _LOW_MASK) + _number_set(start + 1, numbers[1:])
+    return struct.pack("<BBH", GAP, 1, len(body)) + body
 
 
 def acknack(reader: bytes, writer: bytes, base: int, missing: Sequence[int], count: int) -> bytes:
     """Return the receipt of all sequence numbers below `base` and the request of the `missing` ones."""
-    bits = [0] * ((missing[-1] - base) // 32 + 1) if missing else []
-    for seq in missing:
-        bits[(seq - base) // 32] |= 1 << (31 - (seq - base) % 32)
-    count_bits = missing[-1] - base + 1 if missing else 0
-    body = struct.pack(
-        f"<4s4siII{len(bits)}Ii", reader, writer, base >> 32, base & _LOW_MASK, count_bits, *bits, count & 0x7FFF_FFFF
-    )
+    body = struct.pack("<4s4s", reader, writer) + _number_set(base, missing) + struct.pack("<i", count & 0x7FFF_FFFF)
     return struct.pack("<BBH", ACKNACK, 0x01 if missing else 0x03, len(body)) + body
+
+
+def _number_set(base: int, numbers: Sequence[int]) -> bytes:
+    """Return a SequenceNumberSet (section 9.4.2.6): `base`, the number of bits, and the bits."""
+    count = numbers[-1] - base + 1 if numbers else 0
+    bits = [0] * ((count + 31) // 32)
+    for number in numbers:
+        bits[(number - base) // 32] |= 1 << (31 - (number - base) % 32)
+    return struct.pack(f"<iII{len(bits)}I", base >> 32, base & _LOW_MASK, count, *bits)
 
 
 def info_dst(prefix: bytes) -> bytes:
@@ -184,6 +195,7 @@ class ReceivedGap:
     writer: bytes
     start: int
     end: int  # first sequence number after the gap
+    others: Sequence[int]  # further sequence numbers that are not available
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,46 +217,53 @@ class RtpsReader:
         self._prefix = prefix
         self.invalid = 0  # number of datagrams with an invalid or incomplete submessage
 
-    def read(self, datagram: bytes) -> tuple[bytes, list[Submessage]]:
-        """Return the prefix of the sender and the submessages for this participant; empty for its own messages."""
+    def read(self, datagram: bytes) -> tuple[bytes, Iterator[Submessage | None]]:
+        """Return the prefix of the sender and its submessages: None for a submessage that imud ignores.
+
+        The iterator reads one submessage in each step, so that the caller can stop when its budget ends. Messages of
+        this participant itself have no submessages.
+        """
         if len(datagram) < HEADER_BYTES or datagram[:4] != MAGIC[:4] or datagram[4] != MAGIC[4]:
             self.invalid += 1
-            return b"", []
-        prefix, found = datagram[8:HEADER_BYTES], list[Submessage]()
+            return b"", iter(())
+        prefix = datagram[8:HEADER_BYTES]
         if prefix == self._prefix:
-            return prefix, []
+            return prefix, iter(())
+        return prefix, self._submessages(datagram)
+
+    def _submessages(self, datagram: bytes) -> Iterator[Submessage | None]:
         try:
-            found.extend(self._submessages(datagram))
+            yield from self._valid_submessages(datagram)
         except (struct.error, ValueError, IndexError):
             self.invalid += 1
-        return prefix, found
 
-    def _submessages(self, datagram: bytes) -> Iterator[Submessage]:
-        at, is_mine = HEADER_BYTES, True
-        while at + 4 <= len(datagram):
-            kind, flags = datagram[at], datagram[at + 1]
+    def _valid_submessages(self, datagram: bytes) -> Iterator[Submessage | None]:
+        offset = HEADER_BYTES
+        is_mine = True
+        while offset + 4 <= len(datagram):
+            kind, flags = datagram[offset], datagram[offset + 1]
             order = "<" if flags & 1 else ">"
-            (size,) = struct.unpack_from(order + "H", datagram, at + 2)
+            (size,) = struct.unpack_from(order + "H", datagram, offset + 2)
             # length 0: to the end of the datagram, except for PAD and INFO_TS (section 9.4.5.1.3)
-            end = len(datagram) if size == 0 and kind not in (0x01, INFO_TS) else at + 4 + size
+            end = len(datagram) if size == 0 and kind not in (0x01, INFO_TS) else offset + 4 + size
             if end > len(datagram):
                 raise ValueError
-            body = datagram[at + 4 : end]
-            if kind == INFO_DST:
-                is_mine = body[:PREFIX_BYTES] in (self._prefix, bytes(PREFIX_BYTES))
-            elif kind == INFO_SRC:
+            if kind == INFO_SRC:
                 return  # a relay; imud does not need it
+            submessage: Submessage | None = None
+            if kind == INFO_DST:
+                is_mine = datagram[offset + 4 : end][:PREFIX_BYTES] in (self._prefix, bytes(PREFIX_BYTES))
             elif is_mine and kind in _READ:
-                made = _READ[kind](body, flags, order)
-                if made is not None:
-                    yield made
-            at = end
+                submessage = _READ[kind](datagram[offset + 4 : end], flags, order)
+            yield submessage
+            offset = end
 
 
 def _data(body: bytes, flags: int, order: str) -> ReceivedData | None:
     to_inline, _reader, writer, high, low = struct.unpack_from(order + "xxH4s4siI", body)
     if writer not in (PARTICIPANT_WRITER, SUBSCRIPTIONS_WRITER):
         return None
+    seq = _number(high, low)
     at, key, status = 4 + to_inline, b"", 0
     if flags & 0x02:
         inline, at = _parameters(body, at, order)
@@ -255,36 +274,64 @@ def _data(body: bytes, flags: int, order: str) -> ReceivedData | None:
     if flags & 0x0C:
         is_little = body[at + 1] == PL_CDR_LE[1]
         found, _ = _parameters(body, at + 4, "<" if is_little else ">")
-    return ReceivedData(writer, (high << 32) + low, found, is_little, key, bool(status & 3))
+    return ReceivedData(writer, seq, found, is_little, key, bool(status & 3))
 
 
-def _heartbeat(body: bytes, flags: int, order: str) -> ReceivedHeartbeat:
+def _heartbeat(body: bytes, flags: int, order: str) -> ReceivedHeartbeat | None:
     _reader, writer, high, low, last_high, last_low = struct.unpack_from(order + "4s4siIiI", body)
-    return ReceivedHeartbeat(writer, (high << 32) + low, (last_high << 32) + last_low, bool(flags & 2))
+    if writer != SUBSCRIPTIONS_WRITER:
+        return None
+    first = max(1, _number(high, low, minimum=0))  # older participants announce an empty writer with 0
+    last = _number(last_high, last_low, minimum=0)
+    if last < first - 1:
+        raise ValueError
+    return ReceivedHeartbeat(writer, first, last, bool(flags & 2))
 
 
-def _gap(body: bytes, _flags: int, order: str) -> ReceivedGap:
-    _reader, writer, high, low, end_high, end_low = struct.unpack_from(order + "4s4siIiI", body)
-    return ReceivedGap(writer, (high << 32) + low, (end_high << 32) + end_low)
+def _gap(body: bytes, _flags: int, order: str) -> ReceivedGap | None:
+    _reader, writer, high, low = struct.unpack_from(order + "4s4siI", body)
+    if writer != SUBSCRIPTIONS_WRITER:
+        return None
+    start = _number(high, low)
+    end, others = _read_number_set(body, 16, order, minimum=1)
+    if end < start:
+        raise ValueError
+    return ReceivedGap(writer, start, end, others)
 
 
 def _acknack(body: bytes, flags: int, order: str) -> ReceivedAckNack:
-    reader, writer, high, low, count = struct.unpack_from(order + "4s4siII", body)
-    base = (high << 32) + low
-    if count > BITS_MAX:
-        raise ValueError
-    words = struct.unpack_from(f"{order}{(count + 31) // 32}I", body, 20)
-    missing = [base + bit for bit in range(count) if words[bit // 32] >> (31 - bit % 32) & 1]
+    reader, writer = struct.unpack_from("4s4s", body)
+    # some participants begin with an empty set from 0
+    base, missing = _read_number_set(body, 8, order, minimum=0)
     return ReceivedAckNack(reader, writer, base, missing, bool(flags & 2))
 
 
 _READ: Final = {DATA: _data, HEARTBEAT: _heartbeat, GAP: _gap, ACKNACK: _acknack}
 
 
+def _number(high: int, low: int, *, minimum: int = 1) -> int:
+    """Return a sequence number. Raises ValueError if it is out of range."""
+    number = (high << 32) + low
+    if not minimum <= number <= SEQ_MAX:
+        raise ValueError
+    return number
+
+
+def _read_number_set(body: bytes, offset: int, order: str, *, minimum: int) -> tuple[int, Sequence[int]]:
+    """Return the base of a SequenceNumberSet and its numbers. Raises ValueError, struct.error."""
+    high, low, count = struct.unpack_from(order + "iII", body, offset)
+    base = _number(high, low, minimum=minimum)
+    if count > BITS_MAX:
+        raise ValueError
+    words = struct.unpack_from(f"{order}{(count + 31) // 32}I", body, offset + 12)
+    return base, [base + bit for bit in range(count) if words[bit // 32] >> (31 - bit % 32) & 1]
+
+
 def _parameters(body: bytes, at: int, order: str) -> tuple[dict[int, list[bytes]], int]:
-    """Return the parameters and the position after them. Raises struct.error without the end of the list."""
+    """Return the parameters and the position after them. Raises struct.error or ValueError without the end of the
+    list, and for more than PARAMETERS_MAX parameters."""
     found: dict[int, list[bytes]] = {}
-    while True:
+    for _ in range(PARAMETERS_MAX):
         number, size = struct.unpack_from(order + "HH", body, at)
         at += 4
         if number == P_SENTINEL:
@@ -293,6 +340,7 @@ def _parameters(body: bytes, at: int, order: str) -> tuple[dict[int, list[bytes]
             raise ValueError
         found.setdefault(number & ~MUST_UNDERSTAND, []).append(body[at : at + size])
         at += size
+    raise ValueError
 
 
 def _first(found: Mapping[int, Sequence[bytes]], number: int) -> bytes:
@@ -305,7 +353,7 @@ class FoundParticipant:
     """A participant as it announces itself."""
 
     guid: bytes
-    lease_s: int
+    lease_s: int  # 1 to INFINITE_S
     meta: Sequence[Locator]  # addresses for discovery
     default: Sequence[Locator]  # addresses of its readers
 
@@ -341,6 +389,8 @@ def reader_of(received: ReceivedData) -> FoundReader | None:
     topic, type_name = _text(found, P_TOPIC, order), _text(found, P_TYPE, order)
     if len(guid) != GUID_BYTES or not topic or not type_name:
         return None
+    if len(topic) > TEXT_BYTES_MAX or len(type_name) > TEXT_BYTES_MAX:
+        return None
     fits = (
         _int(found, P_DEADLINE, order, INFINITE_S) == INFINITE_S
         and _int(found, P_LIVELINESS, order, 0) == 0
@@ -363,12 +413,12 @@ def _int(found: Mapping[int, Sequence[bytes]], number: int, order: str, default:
 def _text(found: Mapping[int, Sequence[bytes]], number: int, order: str) -> str:
     value = _first(found, number)
     size = max(0, _int(found, number, order, 0))
-    return value[4 : 4 + size].rstrip(b"\0").decode(errors="replace")
+    return value[4 : 4 + min(size, TEXT_BYTES_MAX + 2)].rstrip(b"\0").decode(errors="replace")
 
 
 def _locators(found: Mapping[int, Sequence[bytes]], number: int, order: str) -> list[Locator]:
     made = []
-    for value in found.get(number, ()):
+    for value in found.get(number, ())[:LOCATORS_MAX]:
         if len(value) >= 24:
             kind, port, address = struct.unpack_from(order + "iI12x4s", value)
             if kind == UDP_V4 and 0 < port < 1 << 16 and address != bytes(4):

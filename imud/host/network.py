@@ -5,8 +5,10 @@ import fcntl
 import socket
 import struct
 import threading
+from array import array
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final
+from ipaddress import IPv4Network
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from imud.model.errors import reason_of
 
@@ -70,27 +72,57 @@ def listen(address: str, port: int) -> socket.socket:
     return listener
 
 
-SIOCGIFFLAGS: Final = 0x8913  # linux/sockios.h
-SIOCGIFADDR: Final = 0x8915
+SIOCGIFCONF: Final = 0x8912  # linux/sockios.h
+SIOCGIFFLAGS: Final = 0x8913
+SIOCGIFNETMASK: Final = 0x891B
 IFF_UP, IFF_LOOPBACK, IFF_MULTICAST = 0x1, 0x8, 0x1000  # linux/if.h
+IFREQ_BYTES: Final = 16 + struct.calcsize("LLHBBB0L")  # size of struct ifreq: a name and struct ifmap
+INTERFACES_MAX: Final = 256  # maximum number of addresses of this host that imud reads
 
 
-def multicast_addresses() -> list[str]:
-    """Return the IPv4 addresses of the interfaces that are up and support multicast; otherwise 127.0.0.1."""
-    found, loopback = [], []
-    with open_socket("127.0.0.1", socket.SOCK_DGRAM) as asked:
-        for _, name in socket.if_nameindex():
-            request = struct.pack("16s24x", name.encode()[:15])
+class InterfaceAddress(NamedTuple):
+    """IPv4 address of a network interface that is up."""
+
+    interface_index: int  # index of the interface in the kernel
+    address: str
+    network: IPv4Network
+    is_loopback: bool
+    has_multicast: bool
+
+
+def interface_addresses() -> list[InterfaceAddress]:
+    """Return all IPv4 addresses of this host, also several of one interface."""
+    addresses = []
+    with open_socket("127.0.0.1", socket.SOCK_DGRAM) as requester:
+        buffer = array("B", bytes(IFREQ_BYTES * INTERFACES_MAX))
+        pointer, size = buffer.buffer_info()
+        request = struct.pack("iP", size, pointer)
+        (size,) = struct.unpack_from("i", fcntl.ioctl(requester, SIOCGIFCONF, request))
+        for offset in range(0, size, IFREQ_BYTES):
+            entry = buffer[offset : offset + IFREQ_BYTES].tobytes()
             try:
-                (flags,) = struct.unpack_from("H", fcntl.ioctl(asked, SIOCGIFFLAGS, request), 16)
-                address = socket.inet_ntoa(fcntl.ioctl(asked, SIOCGIFADDR, request)[20:24])
-            except OSError:  # the interface has no IPv4 address
+                addresses.append(_interface_address(requester, entry))
+            except OSError:  # the interface has been removed in the meantime
                 continue
-            if flags & IFF_UP and flags & IFF_LOOPBACK:
-                loopback.append(address)
-            elif flags & IFF_UP and flags & IFF_MULTICAST:
-                found.append(address)
-    return found or loopback
+    return [address for address in addresses if address is not None]
+
+
+def _interface_address(requester: socket.socket, entry: bytes) -> InterfaceAddress | None:
+    """Return the address of an entry of SIOCGIFCONF; None if the interface is down. Raises OSError."""
+    label = entry[:16].partition(b"\0")[0].decode(errors="surrogateescape")
+    (flags,) = struct.unpack_from("H", fcntl.ioctl(requester, SIOCGIFFLAGS, entry), 16)
+    if not flags & IFF_UP:
+        return None
+    # the kernel selects the address by the label and the address in the request
+    mask = socket.inet_ntoa(fcntl.ioctl(requester, SIOCGIFNETMASK, entry)[20:24])
+    address = socket.inet_ntoa(entry[20:24])
+    return InterfaceAddress(
+        socket.if_nametoindex(label.partition(":")[0]),
+        address,
+        IPv4Network(f"{address}/{mask}", strict=False),
+        bool(flags & IFF_LOOPBACK),
+        bool(flags & IFF_MULTICAST),
+    )
 
 
 def tls_context(ca_file: str | None) -> "ssl.SSLContext":

@@ -2,13 +2,17 @@
 
 import asyncio
 import errno
+import os
 import socket
+import subprocess
+import sys
 import threading
+from ipaddress import IPv4Address, IPv4Network
 from typing import Any
 
 import pytest
 
-from imud.host.network import listen, resolve
+from imud.host.network import interface_addresses, listen, resolve
 from imud.host.scrape_server import HttpRequest, HttpResponse, ScrapeServer
 from imud.model.errors import ServerError
 from imud.publishers.nmea0183 import TcpOutput, UdpOutput
@@ -82,3 +86,28 @@ async def test_addresses_of_a_name() -> None:
     assert await resolve("127.0.0.1", 1) == ["127.0.0.1"]
     with pytest.raises(OSError, match="label"):
         await resolve("a" * 64 + ".example", 1)
+
+
+def test_addresses_of_interfaces() -> None:
+    """127.0.0.1 with its network is an address of each host."""
+    addresses = interface_addresses()
+    (loopback,) = [address for address in addresses if address.address == "127.0.0.1"]
+    assert (loopback.network, loopback.is_loopback) == (IPv4Network("127.0.0.0/8"), True)
+    assert socket.if_indextoname(loopback.interface_index) == "lo"
+    assert all(IPv4Address(address.address) in address.network for address in addresses)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root for a network of its own")
+def test_several_addresses_of_an_interface() -> None:
+    """Secondary addresses have their own networks. The label of an old alias is `lo:1`. Interfaces that are down have
+    no usable address."""
+    setup = (
+        "ip link set lo up; ip addr add 192.0.2.5/24 dev lo; ip addr add 198.51.100.1/32 dev lo label lo:1;"
+        "ip link add dummy0 type dummy 2>/dev/null && ip addr add 203.0.113.1/24 dev dummy0;"
+    )
+    program = "from imud.host.network import interface_addresses as f; print([str(a.network) for a in f()])"
+    command = ["unshare", "-n", "sh", "-c", f'{setup} exec "$0" -c "$1"', sys.executable, program]
+    output = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False)
+    if output.returncode:
+        pytest.skip(f"cannot create a network: {output.stderr.strip()}")
+    assert output.stdout.strip() == "['127.0.0.0/8', '192.0.2.0/24', '198.51.100.1/32']"

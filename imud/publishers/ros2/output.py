@@ -18,7 +18,8 @@ from imud.formats.rtps import PREFIX_BYTES
 from imud.model.sample import Sample
 from imud.model.units import NS_PER_S
 from imud.publishers.ros2.options import Ros2Options
-from imud.publishers.ros2.participant import RtpsParticipant, RtpsWriter
+from imud.publishers.ros2.participant import RtpsParticipant
+from imud.publishers.ros2.writer import RtpsWriter
 from imud.publishers.thinning import Pace
 
 log = logging.getLogger(__name__)
@@ -55,7 +56,11 @@ class Ros2Output:
     def __init__(self, settings: Ros2Options, context: PublisherContext) -> None:
         self._settings = settings
         self._context = context
-        self._participant = RtpsParticipant(settings.domain_id, settings.address, settings.node, context.clock.now_ns)
+        clock = context.clock
+        self._participant = RtpsParticipant(
+            settings.domain_id, settings.address, settings.node, clock.now_ns, clock.cpu_ns
+        )
+        self._participant.accepted_types = frozenset(map(dds_type, TYPE_HASHES))
         self._devices: dict[str, _PublishedDevice] = {}
         self._diagnosis = LiveDiagnosis()
         self._diagnostics = Ros2Dialect().diagnostics()

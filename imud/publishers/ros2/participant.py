@@ -1,284 +1,73 @@
 """DDS participant with writers only: it finds the readers of other participants, and sends them samples with UDP.
 
     every 3 s: SPDP, multicast 239.255.0.1 ──▶ participants ──▶ SEDP, unicast: our writers, their readers
-    write ──▶ one datagram per destination: INFO_TS, DATA, HEARTBEAT ──▶ ACKNACK of a reliable reader ──▶ DATA again
+    datagram ──budget of its sender──▶ submessage ──budget──▶ submessage … ──▶ replies, with a budget
 
-All sockets are nonblocking and belong to the thread of the event loop. A writer keeps its newest DEPTH samples for
-readers that request them again. Nothing waits for a reader.
+All sockets are nonblocking and belong to the thread of the event loop. Nothing waits for a reader.
 """
 
 import asyncio
-import logging
-import os
 import socket
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+import time
+from collections.abc import Callable, Collection, Iterable
+from ipaddress import IPv4Address
 from typing import Final
 
 from imud.formats import rtps
-from imud.formats.rtps import FoundParticipant, FoundReader, Locator, ReceivedAckNack, ReceivedData
-from imud.host.network import multicast_addresses, open_socket
-from imud.model.errors import ServerError, reason_of
+from imud.formats.rtps import FoundReader, ReceivedAckNack, ReceivedData, ReceivedGap, ReceivedHeartbeat
 from imud.model.units import NS_PER_S
-from imud.publishers.ros2.options import PORT_BASE, PORT_STEP
+from imud.publishers.ros2.network import RtpsNetwork
+from imud.publishers.ros2.peers import LEASE_MAX_S, PEERS_MAX, WINDOW, PeerTable, RtpsPeer
+from imud.publishers.ros2.writer import MatchedReader, RtpsWriter
 
-log = logging.getLogger(__name__)
-
-UNICAST_PORT: Final = 10  # first unicast port after the multicast port; two ports for each participant of a host
-PARTICIPANTS_MAX: Final = 100  # participants of one host with a well-known port, as in the default of Fast DDS
-GROUP: Final = "239.255.0.1"
 ANNOUNCE_NS: Final = 3 * NS_PER_S  # time between two announcements of this participant, as in Fast DDS
+NETWORK_NS: Final = NS_PER_S  # time between two reads of the addresses of this host
 LEASE_S: Final = 20  # time without an announcement after which others forget this participant, as in Fast DDS
-DEPTH: Final = 10  # samples for retransmission, the depth of the sensor data of ROS 2
-PEERS_MAX: Final = 256  # maximum number of other participants: the processes of a large robot
-READERS_MAX: Final = 4096  # maximum number of readers of all participants
 DATAGRAM_BYTES: Final = 65536
-READS_PER_TURN: Final = 32  # maximum number of datagrams that one turn of the event loop reads
-SEND_BUFFER_BYTES: Final = 1 << 20
-
-
-@dataclass(slots=True)
-class MatchedReader:
-    """Reader that receives the samples of a writer."""
-
-    guid: bytes
-    where: Locator
-    is_reliable: bool
-    start: int  # first sequence number for this reader
-    acked: int  # the reader has all samples up to this sequence number
-
-
-@dataclass(slots=True)
-class RtpsPeer:
-    """Another participant."""
-
-    found: FoundParticipant
-    source: str  # IP address of its announcement
-    until_ns: int  # time at which its lease ends
-    readers: dict[bytes, FoundReader] = field(default_factory=dict)
-    next_seq: int = 1  # all descriptions of readers below this sequence number have arrived
-    arrived: set[int] = field(default_factory=set)
-    counts: int = 0  # ACKNACK messages so far
-
-    def best(self, locators: Iterable[Locator]) -> Locator:
-        """Return the address in the network of its announcements, otherwise the first address."""
-        known = list(locators) or list(self.found.default)
-        return next((one for one in known if one.address == self.source), known[0])
-
-    def arrive(self, seq: int) -> None:
-        """Note a description, or a gap."""
-        if seq >= self.next_seq and len(self.arrived) < READERS_MAX:
-            self.arrived.add(seq)
-        while self.next_seq in self.arrived:
-            self.arrived.remove(self.next_seq)
-            self.next_seq += 1
-
-
-class RtpsWriter:
-    """Writer of one topic."""
-
-    def __init__(self, network: "RtpsNetwork", entity: bytes, topic: str, type_name: str, *, is_kept: bool) -> None:
-        """`is_kept`: later readers also receive the kept samples (TRANSIENT_LOCAL), otherwise only new samples."""
-        self._network = network
-        self.entity, self.topic, self.type_name, self.is_kept = entity, topic, type_name, is_kept
-        self.depth: int | None = 1 if is_kept else DEPTH  # None: samples of a key replace each other
-        self.kept: dict[int, bytes] = {}  # DATA submessages by sequence number
-        self.last = 0  # newest sequence number
-        self.sent = self.dropped = 0
-        self.readers: dict[bytes, MatchedReader] = {}
-        self._destinations: list[tuple[Locator, int]] = []  # with the number of readers
-        self._count = 0
-
-    def write(self, payload: bytes, utc_ns: int) -> None:
-        """Send a sample to all readers."""
-        if len(payload) > rtps.PAYLOAD_MAX:
-            self.dropped += len(self.readers)
-            return
-        made = rtps.info_ts(utc_ns) + self.keep(payload)
-        first, self._count = next(iter(self.kept)), self._count + 1
-        made += rtps.heartbeat(self.entity, first, self.last, self._count, final=True)
-        for where, count in self._destinations:
-            if self._network.send(made, where):
-                self.sent += count
-            else:
-                self.dropped += count
-
-    def keep(self, payload: bytes, key: bytes = b"", *, ended: bool = False) -> bytes:
-        """Add a sample and return its DATA."""
-        self.last += 1
-        made = self.kept[self.last] = rtps.data(self.entity, self.last, payload, key=key, ended=ended)
-        if self.depth is not None and len(self.kept) > self.depth:
-            del self.kept[next(iter(self.kept))]
-        return made
-
-    def match(self, reader: MatchedReader) -> None:
-        """Add or replace a reader."""
-        known = self.readers.get(reader.guid)
-        if known is not None and known.where == reader.where:
-            return
-        first = min(self.kept, default=1) if self.is_kept else self.last + 1
-        reader.start, reader.acked = first, first - 1
-        self.readers[reader.guid] = reader
-        self._changed()
-        if reader.is_reliable:
-            self.announce(reader)
-
-    def forget(self, guids: Iterable[bytes]) -> None:
-        """Remove readers."""
-        for guid in guids:
-            self.readers.pop(guid, None)
-        self._changed()
-
-    def tick(self) -> None:
-        """Ask each reliable reader for a receipt if it did not acknowledge the newest sample."""
-        for reader in self.readers.values():
-            if reader.is_reliable and reader.acked < self.last:
-                self.announce(reader)
-
-    def announce(self, reader: MatchedReader) -> None:
-        """Send the available sequence numbers to a reader."""
-        self._count += 1
-        first = max(reader.start, next(iter(self.kept), self.last + 1))
-        entity = reader.guid[rtps.PREFIX_BYTES :]
-        self._send_to(reader, rtps.heartbeat(self.entity, first, self.last, self._count, reader=entity))
-
-    def acknowledge(self, guid: bytes, received: ReceivedAckNack) -> None:
-        """Process a receipt: send the requested samples again, and count the requested samples that are gone."""
-        reader = self.readers.get(guid)
-        if reader is None:
-            return
-        reader.acked = max(reader.acked, min(received.base - 1, self.last))
-        for seq in received.missing:
-            if seq > self.last:
-                break
-            made = self.kept.get(seq) if seq >= reader.start else None
-            if made is None:
-                self.dropped += seq >= reader.start and self.depth is not None
-                made = rtps.gap(self.entity, guid[rtps.PREFIX_BYTES :], seq)
-            self._send_to(reader, made)
-        if not received.is_final and not received.missing:
-            self.announce(reader)
-
-    def _send_to(self, reader: MatchedReader, made: bytes) -> None:
-        self._network.send(rtps.info_dst(reader.guid[: rtps.PREFIX_BYTES]) + made, reader.where)
-
-    def _changed(self) -> None:
-        counts: dict[Locator, int] = {}
-        for reader in self.readers.values():
-            counts[reader.where] = counts.get(reader.where, 0) + 1
-        self._destinations = list(counts.items())
-
-
-class RtpsNetwork:
-    """Sockets of a participant."""
-
-    def __init__(self, domain: int, address: str | None) -> None:
-        self._wanted = address
-        self._group = (GROUP, PORT_BASE + PORT_STEP * domain)
-        self._unicast: socket.socket | None = None
-        self._multicast: socket.socket | None = None
-        self.prefix = rtps.VENDOR + os.urandom(rtps.PREFIX_BYTES - len(rtps.VENDOR))
-        self._header = rtps.header(self.prefix)
-        self._joined: list[str] = []
-        self.port = 0
-        self.problem = ""  # reason why imud cannot announce itself, one sentence
-
-    @property
-    def locators(self) -> list[Locator]:
-        """Addresses of this participant."""
-        return [Locator(address, self.port) for address in self._joined]
-
-    def open(self) -> tuple[socket.socket, socket.socket]:
-        """Open both sockets and return them. Raises ServerError."""
-        try:
-            self._multicast = shared = open_socket("0.0.0.0", socket.SOCK_DGRAM)
-            shared.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            shared.bind(("", self._group[1]))
-            self._unicast = own = open_socket("0.0.0.0", socket.SOCK_DGRAM)
-            own.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
-            self.port = self._bind(own)
-        except OSError as error:
-            self.close()
-            raise ServerError(f"ros2: cannot use the UDP port {self._group[1]}: {reason_of(error)}") from error
-        return shared, own
-
-    def _bind(self, own: socket.socket) -> int:
-        host = self._wanted or ""
-        for number in range(PARTICIPANTS_MAX):
-            try:
-                own.bind((host, self._group[1] + UNICAST_PORT + 2 * number))
-                break
-            except OSError:  # another participant of this host has this port
-                continue
-        else:
-            own.bind((host, 0))
-        return int(own.getsockname()[1])
-
-    def refresh(self) -> bool:
-        """Join the multicast group on new interfaces. Return whether the addresses changed."""
-        before, self._joined = self._joined, []
-        self.problem = ""
-        for address in [self._wanted] if self._wanted is not None else multicast_addresses():
-            member = socket.inet_aton(GROUP) + socket.inet_aton(address)
-            try:
-                if address not in before and self._multicast is not None:
-                    self._multicast.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
-            except OSError as error:
-                self.problem = f"cannot receive multicast at {address}: {reason_of(error)}"
-                continue
-            self._joined.append(address)
-        if not self._joined and not self.problem:
-            self.problem = "expected a network interface with an IPv4 address, got none; connect a network"
-        return self._joined != before
-
-    def send(self, made: bytes, where: Locator) -> bool:
-        """Send submessages. Return False if the kernel does not accept the datagram now."""
-        if self._unicast is None:
-            return False
-        try:
-            self._unicast.sendto(self._header + made, where)
-        except OSError:
-            return False
-        return True
-
-    def multicast(self, made: bytes) -> None:
-        """Send submessages to all participants of the domain, on each interface."""
-        for address in self._joined:
-            if self._unicast is not None:
-                try:
-                    self._unicast.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(address))
-                    self._unicast.sendto(self._header + made, self._group)
-                except OSError as error:
-                    self.problem = f"cannot send multicast at {address}: {reason_of(error)}"
-
-    def close(self) -> None:
-        """Close both sockets. A second call does nothing."""
-        for one in (self._unicast, self._multicast):
-            if one is not None:
-                one.close()
-        self._unicast = self._multicast = None
-        self._joined = []
+READS_PER_TURN: Final = 32  # maximum number of datagrams of one socket in one turn of the event loop
+HEARTBEATS_PER_TICK: Final = 64  # maximum number of requests for receipts in one tick, 0.1 to 0.5 s
+# Time for which the status shows refused participants and readers: as long as the lease of others can last
+REFUSED_NS: Final = LEASE_MAX_S * NS_PER_S
 
 
 class RtpsParticipant:
     """Participant of a domain. Synchronization: the event loop's thread only."""
 
-    def __init__(self, domain: int, address: str | None, name: str, now_ns: Callable[[], int]) -> None:
+    def __init__(
+        self,
+        domain: int,
+        address: str | None,
+        name: str,
+        now_ns: Callable[[], int],
+        cpu_ns: Callable[[], int] = time.thread_time_ns,
+        network: RtpsNetwork | None = None,
+    ) -> None:
+        """`now_ns` returns CLOCK_MONOTONIC, `cpu_ns` the CPU time of the event loop's thread. `network`: None for the
+        network of this host."""
         self._domain, self._name, self._now_ns = domain, name, now_ns
-        self._network = RtpsNetwork(domain, address)
+        self._network = network or RtpsNetwork(domain, address, cpu_ns)
         self._reader = rtps.RtpsReader(self._network.prefix)
-        self._peers: dict[bytes, RtpsPeer] = {}
+        self._peers = PeerTable()
+        self._receipts: dict[bytes, RtpsPeer] = {}  # participants that get a receipt at the end of the turn
         self._writers: dict[bytes, RtpsWriter] = {}
+        self._topics: dict[tuple[str, str], list[RtpsWriter]] = {}  # writers by topic and type
+        # Types of the topics that this participant can have; it stores no readers of other types. None: all types.
+        self.accepted_types: Collection[str] | None = None
         self._hashes: dict[bytes, str] = {}
         self._publications = RtpsWriter(self._network, rtps.PUBLICATIONS_WRITER, "", "", is_kept=True)
         self._publications.depth = None
+        self._publications.destinations_max = self._publications.ports_max = PEERS_MAX
         self._described: dict[bytes, int] = {}  # sequence number of the description of each writer
         self._entities = 0
         self._announce_ns = 0
+        self._network_ns = 0  # time of the next read of the addresses of this host
         self._announced = 0
         self._sockets: tuple[socket.socket, ...] = ()
+        self._is_reading = False
         self._retired = [0, 0]  # sent and dropped of removed writers
-        self.refused = 0  # number of participants and readers above the limits
+        self.refused = 0  # number of participants, readers and datagrams that the limits refuse
+        self._refusal = ""  # sentence about the newest refusal
+        self._refusal_ns = 0
 
     @property
     def guid(self) -> bytes:
@@ -290,12 +79,17 @@ class RtpsParticipant:
 
     @property
     def problem(self) -> str:
-        return self._network.problem
+        """Reason why participants get no samples, one sentence; empty without."""
+        now_ns = self._now_ns()
+        problem = self._network.problem(now_ns)
+        if not problem and self._refusal and now_ns - self._refusal_ns < REFUSED_NS:
+            return self._refusal
+        return problem
 
     @property
     def discarded(self) -> int:
-        """Number of invalid datagrams, and of descriptions of participants and readers above the limits."""
-        return self._reader.invalid + self.refused
+        """Number of invalid datagrams, of inputs above the budgets, and of refused participants and readers."""
+        return self._reader.invalid + self.refused + self._network.budget.refused
 
     @property
     def totals(self) -> tuple[int, int]:
@@ -308,55 +102,76 @@ class RtpsParticipant:
 
     def open(self) -> None:
         """Open the sockets and start to read. Raises ServerError."""
-        loop = asyncio.get_running_loop()
         self._sockets = self._network.open()
-        for one in self._sockets:
-            loop.add_reader(one.fileno(), self._read, one)
+        self._read_again()
+
+    def _read_again(self) -> None:
+        """Read the sockets if this participant does not read them now."""
+        if self._sockets and not self._is_reading:
+            self._is_reading = True
+            loop = asyncio.get_running_loop()
+            for each in self._sockets:
+                loop.add_reader(each.fileno(), self._read, each)
+
+    def _stop_reading(self) -> None:
+        """Leave the datagrams in the kernel, which discards them if its queue is full. The next tick reads again."""
+        if self._is_reading:
+            self._is_reading = False
+            loop = asyncio.get_running_loop()
+            for each in self._sockets:
+                loop.remove_reader(each.fileno())
 
     def add(self, topic: str, type_name: str, type_hash: str, *, is_kept: bool = False) -> RtpsWriter:
         """Add a writer, announce it, and match it with the known readers."""
         self._entities += 1
         entity = self._entities.to_bytes(3, "big") + bytes([rtps.KIND_WRITER_NO_KEY])
         made = self._writers[entity] = RtpsWriter(self._network, entity, topic, type_name, is_kept=is_kept)
+        self._topics.setdefault((topic, type_name), []).append(made)
         self._hashes[entity] = type_hash
         self._describe(made)
-        for peer in self._peers.values():
+        for peer in self._peers:
             for reader in peer.readers.values():
-                self._match(peer, reader, [made])
+                if (reader.topic, reader.type_name) == (topic, type_name):
+                    self._match(peer, reader, [made], self._now_ns())
         return made
 
     def remove(self, writer: RtpsWriter) -> None:
         """Remove a writer and announce it."""
         del self._writers[writer.entity]
+        topic = (writer.topic, writer.type_name)
+        self._topics[topic].remove(writer)
+        if not self._topics[topic]:
+            del self._topics[topic]
         self._retired[0] += writer.sent
         self._retired[1] += writer.dropped
         guid = self._network.prefix + writer.entity
         self._publications.kept.pop(self._described.pop(writer.entity), None)
         self._publications.keep(rtps.key_of(guid, is_participant=False), guid, ended=True)
-        self._publications.tick()
+        self._publications.tick(HEARTBEATS_PER_TICK)
 
     def tick(self, now_ns: int) -> None:
         """Announce this participant if it is due, remove silent participants, and ask readers for receipts."""
+        self._network.start_turn(now_ns)
+        if now_ns >= self._network_ns:
+            self._network_ns = now_ns + NETWORK_NS
+            if self._network.refresh():
+                self._announce_ns = now_ns  # other participants must learn the new address
         if now_ns >= self._announce_ns:
             self._announce_ns = now_ns + ANNOUNCE_NS
-            self._network.refresh()
             self._network.multicast(self._announcement())
-        for prefix in [prefix for prefix, peer in self._peers.items() if now_ns >= peer.until_ns]:
-            self._forget(prefix)
-        self._publications.tick()
+        for peer in self._peers:
+            if now_ns >= peer.until_ns or not self._network.is_reachable(peer.address):
+                self._forget(peer)
+        count = self._publications.tick(HEARTBEATS_PER_TICK)
         for writer in self._writers.values():
-            writer.tick()
+            count = writer.tick(count)
+        self._read_again()
 
     def received(self, datagram: bytes, source: str, now_ns: int) -> None:
-        """Process a datagram."""
-        prefix, found = self._reader.read(datagram)
-        for one in found:
-            if isinstance(one, ReceivedAckNack):
-                self._acknowledged(prefix, one)
-            elif isinstance(one, ReceivedData) and one.writer == rtps.PARTICIPANT_WRITER:
-                self._participant(one, source, now_ns)
-            elif (peer := self._peers.get(prefix)) is not None and one.writer == rtps.SUBSCRIPTIONS_WRITER:
-                self._subscription(prefix, peer, one)
+        """Process a datagram in a turn of its own."""
+        self._network.start_turn(now_ns)
+        self._process(datagram, source, now_ns)
+        self._end_turn()
 
     def close(self) -> None:
         """Announce the end of this participant and close the sockets. A second call does nothing."""
@@ -365,22 +180,87 @@ class RtpsParticipant:
             key = rtps.key_of(self.guid, is_participant=True)
             made = rtps.data(rtps.PARTICIPANT_WRITER, self._announced, key, key=self.guid, ended=True)
             self._network.multicast(made)
-            for peer in self._peers.values():
-                self._network.send(made, peer.best(peer.found.meta))
-            loop = asyncio.get_running_loop()
-            for one in self._sockets:
-                loop.remove_reader(one.fileno())
+            for peer in self._peers:
+                self._network.send(made, peer.meta)
+            self._stop_reading()
         self._sockets = ()
         self._network.close()
 
-    def _read(self, one: socket.socket) -> None:
+    def _read(self, source_socket: socket.socket) -> None:
         now_ns = self._now_ns()
+        budget = self._network.budget
+        self._network.start_turn(now_ns)
         for _ in range(READS_PER_TURN):
+            if budget.is_turn_over:
+                break
             try:
-                datagram, (source, _port) = one.recvfrom(DATAGRAM_BYTES)
+                datagram, (source, _port) = source_socket.recvfrom(DATAGRAM_BYTES)
             except OSError:  # no data, or an ICMP error of an earlier datagram
+                break
+            self._process(datagram, source, now_ns)
+        self._end_turn()
+        if budget.is_spent:
+            self._stop_reading()
+
+    def _end_turn(self) -> None:
+        """Send one receipt to each participant whose descriptions arrived in this turn."""
+        for peer in self._receipts.values():
+            self._send_receipt(peer)
+        self._receipts.clear()
+        self._network.budget.end_turn()
+
+    def _process(self, datagram: bytes, source: str, now_ns: int) -> None:
+        """Process the submessages of a datagram until the budget of its sender ends."""
+        prefix, submessages = self._reader.read(datagram)
+        source = self._sender_address(prefix, source)
+        peer = self._peers.hear(prefix, source, now_ns)
+        admit = self._network.budget.admit
+        if not admit(source):
+            return
+        if not self._network.is_reachable(source):
+            self._refuse_network(source, now_ns)
+            return
+        for submessage in submessages:
+            if isinstance(submessage, ReceivedData) and submessage.writer == rtps.PARTICIPANT_WRITER:
+                self._participant(prefix, submessage, source, now_ns)
+                peer = self._peers.hear(prefix, source, now_ns)
+            elif peer is not None and submessage is not None:
+                self._of_peer(peer, submessage, now_ns)
+            if not admit(source):
                 return
-            self.received(datagram, source, now_ns)
+
+    def _sender_address(self, prefix: bytes, source: str) -> str:
+        """Return the address of the sender of a datagram. Fast DDS on this host announces the address of a network
+        interface with multicast, and sends all other datagrams from the loopback address."""
+        peer = self._peers.get(prefix)
+        if peer is None or self._network.is_reachable(source) or not self._network.is_own(peer.address):
+            return source
+        return peer.address if IPv4Address(source).is_loopback else source
+
+    def _of_peer(self, peer: RtpsPeer, submessage: rtps.Submessage, now_ns: int) -> None:
+        """Process a submessage of a known participant."""
+        if isinstance(submessage, ReceivedAckNack):
+            self._acknowledged(peer, submessage)
+        elif isinstance(submessage, ReceivedHeartbeat):
+            peer.skip_to(submessage.first)
+            peer.last = submessage.last
+            if not submessage.is_final or peer.missing(peer.last):
+                self._receipts[peer.prefix] = peer
+        elif isinstance(submessage, ReceivedGap):
+            if submessage.start <= peer.next_seq:
+                peer.skip_to(submessage.end)
+            peer.arrive(range(max(submessage.start, peer.next_seq), min(submessage.end, peer.next_seq + WINDOW)))
+            peer.arrive(submessage.others)
+        else:
+            self._subscription(peer, submessage, now_ns)
+
+    def _send_receipt(self, peer: RtpsPeer) -> None:
+        """Acknowledge the descriptions of readers and request the missing ones."""
+        peer.counts += 1
+        receipt = rtps.acknack(
+            rtps.SUBSCRIPTIONS_READER, rtps.SUBSCRIPTIONS_WRITER, peer.next_seq, peer.missing(peer.last), peer.counts
+        )
+        self._network.reply(rtps.info_dst(peer.prefix) + receipt, peer.meta)
 
     def _announcement(self) -> bytes:
         self._announced += 1
@@ -409,91 +289,128 @@ class RtpsParticipant:
         ])  # fmt: skip
         self._publications.keep(payload, guid)
         self._described[writer.entity] = self._publications.last
-        self._publications.tick()
+        self._publications.tick(HEARTBEATS_PER_TICK)
 
-    def _participant(self, received: ReceivedData, source: str, now_ns: int) -> None:
+    def _participant(self, prefix: bytes, received: ReceivedData, source: str, now_ns: int) -> None:
+        """Process the announcement of a participant, or its end. Only the participant itself can announce it."""
+        peer = self._peers.get(prefix)
         if received.ended:
             guid = received.key or rtps.guid_in(received)
-            self._forget(guid[: rtps.PREFIX_BYTES])
+            if peer is not None and guid[: rtps.PREFIX_BYTES] == prefix and peer.sends_from(source):
+                self._forget(peer)
             return
         found = rtps.participant_of(received)
-        if found is None:
+        if found is None or found.guid[: rtps.PREFIX_BYTES] != prefix:
             return
-        prefix = found.guid[: rtps.PREFIX_BYTES]
-        until_ns = now_ns + found.lease_s * NS_PER_S
-        known = self._peers.get(prefix)
-        if known is not None:
-            known.until_ns, known.found = until_ns, found
+        if peer is not None:
+            if self._peers.announce(peer, found, source, now_ns):
+                self._connect(peer, now_ns)
             return
-        if len(self._peers) >= PEERS_MAX:
-            self.refused += 1
+        limit = self._peers.find_limit(source)
+        if limit:
+            self._refuse(
+                f"refused a participant at {source}: expected at most {limit}, got more; end programs of ROS 2 or use "
+                "another domain",
+                now_ns,
+            )
+            silent = self._peers.find_silent(source, now_ns)
+            if silent is None:
+                return
+            self._forget(silent)
+        peer = RtpsPeer(found, source, now_ns)
+        self._peers.add(peer)
+        self._network.reply(self._announcement(), peer.meta)
+        self._connect(peer, now_ns)
+
+    def _connect(self, peer: RtpsPeer, now_ns: int) -> None:
+        """Send the descriptions of the writers and the samples to the present address of a participant."""
+        self._publications.match(MatchedReader(peer.prefix + rtps.PUBLICATIONS_READER, peer.meta, is_reliable=True))
+        for reader in peer.readers.values():
+            self._match(peer, reader, self._writers_for(reader), now_ns)
+
+    def _subscription(self, peer: RtpsPeer, received: ReceivedData, now_ns: int) -> None:
+        """Process the description of a reader, or its end."""
+        peer.arrive([received.seq])
+        if received.ended:
+            self._remove_reader(peer, received.key or rtps.guid_in(received))
             return
-        peer = self._peers[prefix] = RtpsPeer(found, source, until_ns)
-        where = peer.best(found.meta)
-        self._network.send(self._announcement(), where)
-        self._publications.match(
-            MatchedReader(prefix + rtps.PUBLICATIONS_READER, where, is_reliable=True, start=1, acked=0)
+        reader = rtps.reader_of(received)
+        if reader is None or reader.guid[: rtps.PREFIX_BYTES] != peer.prefix:
+            return
+        if self.accepted_types is not None and reader.type_name not in self.accepted_types:
+            return
+        previous = peer.readers.get(reader.guid)
+        if previous == reader:
+            return
+        if previous is not None:
+            self._remove_reader(peer, reader.guid)
+        limit = self._peers.add_reader(peer, reader)
+        if limit:
+            self._refuse_reader(peer, limit, now_ns)
+            return
+        self._match(peer, reader, self._writers_for(reader), now_ns)
+
+    def _refuse_network(self, source: str, now_ns: int) -> None:
+        if IPv4Address(source).is_loopback:
+            self.refused += 1  # Fast DDS on this host, before its announcement with multicast
+            return
+        self._refuse(
+            f"ignored the participant at {source}: expected an address in {self._network.networks}, got another "
+            "network; connect imud to the network of the robot",
+            now_ns,
         )
 
-    def _subscription(self, prefix: bytes, peer: RtpsPeer, one: rtps.Submessage) -> None:
-        if isinstance(one, rtps.ReceivedHeartbeat):
-            peer.next_seq = max(peer.next_seq, one.first)
-            peer.arrived = {seq for seq in peer.arrived if seq >= peer.next_seq}
-            peer.arrive(0)
-            last = min(one.last, peer.next_seq + rtps.BITS_MAX - 1)
-            missing = [seq for seq in range(peer.next_seq, last + 1) if seq not in peer.arrived]
-            if missing or not one.is_final:
-                peer.counts += 1
-                receipt = rtps.acknack(
-                    rtps.SUBSCRIPTIONS_READER, rtps.SUBSCRIPTIONS_WRITER, peer.next_seq, missing, peer.counts
-                )
-                self._network.send(rtps.info_dst(prefix) + receipt, peer.best(peer.found.meta))
-        elif isinstance(one, rtps.ReceivedGap):
-            for seq in range(one.start, min(one.end, one.start + rtps.BITS_MAX)):
-                peer.arrive(seq)
-        elif isinstance(one, ReceivedData):
-            peer.arrive(one.seq)
-            if one.ended:
-                self._forget_readers(peer, [one.key or rtps.guid_in(one)])
-            elif (reader := rtps.reader_of(one)) is not None and reader.guid.startswith(prefix):
-                self._add_reader(peer, reader)
+    def _refuse_reader(self, peer: RtpsPeer, limit: str, now_ns: int) -> None:
+        self._refuse(
+            f"refused a reader of the participant at {peer.address}: expected at most {limit}, got more; end programs "
+            "of ROS 2 or use another domain",
+            now_ns,
+        )
 
-    def _add_reader(self, peer: RtpsPeer, reader: FoundReader) -> None:
-        if reader.guid not in peer.readers and sum(len(one.readers) for one in self._peers.values()) >= READERS_MAX:
-            self.refused += 1
-            return
-        peer.readers[reader.guid] = reader
-        self._match(peer, reader, self._writers.values())
+    def _refuse(self, problem: str, now_ns: int) -> None:
+        """Count a refusal. The status shows the newest refusal."""
+        self.refused += 1
+        self._refusal = problem
+        self._refusal_ns = now_ns
 
-    def _match(self, peer: RtpsPeer, reader: FoundReader, writers: Iterable[RtpsWriter]) -> None:
+    def _match(self, peer: RtpsPeer, reader: FoundReader, writers: Iterable[RtpsWriter], now_ns: int) -> None:
+        """Add a reader to writers of its topic, or change its address."""
         for writer in writers:
             durability = rtps.TRANSIENT_LOCAL if writer.is_kept else rtps.VOLATILE
             if (
-                (reader.topic, reader.type_name) == (writer.topic, writer.type_name)
-                and reader.fits
+                reader.fits
                 and reader.durability <= durability
+                and not writer.match(MatchedReader(reader.guid, peer.destination(reader), reader.is_reliable))
             ):
-                where = peer.best(reader.locators)
-                writer.match(MatchedReader(reader.guid, where, reader.is_reliable, start=1, acked=0))
+                limit = f"{writer.ports_max} ports of one address and {writer.destinations_max} destinations of a topic"
+                self._refuse_reader(peer, limit, now_ns)
 
-    def _acknowledged(self, prefix: bytes, received: ReceivedAckNack) -> None:
-        guid = prefix + received.reader
+    def _acknowledged(self, peer: RtpsPeer, received: ReceivedAckNack) -> None:
+        guid = peer.prefix + received.reader
+        writer = self._writers.get(received.writer)
         if received.writer == rtps.PUBLICATIONS_WRITER:
-            self._publications.acknowledge(guid, received)
-        elif (writer := self._writers.get(received.writer)) is not None:
-            writer.acknowledge(guid, received)
+            writer = self._publications
+        if writer is not None and writer.acknowledge(guid, received):
+            peer.is_confirmed = True
 
-    def _forget(self, prefix: bytes) -> None:
-        peer = self._peers.pop(prefix, None)
-        if peer is not None:
-            self._publications.forget([prefix + rtps.PUBLICATIONS_READER])
-            self._forget_readers(peer, list(peer.readers))
+    def _forget(self, peer: RtpsPeer) -> None:
+        """Remove a participant and its readers."""
+        self._peers.remove(peer)
+        self._receipts.pop(peer.prefix, None)
+        self._publications.forget(peer.prefix + rtps.PUBLICATIONS_READER)
+        for guid, reader in peer.readers.items():
+            for writer in self._writers_for(reader):
+                writer.forget(guid)
 
-    def _forget_readers(self, peer: RtpsPeer, guids: list[bytes]) -> None:
-        for guid in guids:
-            peer.readers.pop(guid, None)
-        for writer in self._writers.values():
-            writer.forget(guids)
+    def _remove_reader(self, peer: RtpsPeer, guid: bytes) -> None:
+        """Remove a reader from its participant and from all writers."""
+        reader = self._peers.remove_reader(peer, guid)
+        if reader is not None:
+            for writer in self._writers_for(reader):
+                writer.forget(guid)
+
+    def _writers_for(self, reader: FoundReader) -> Iterable[RtpsWriter]:
+        return self._topics.get((reader.topic, reader.type_name), ())
 
 
 def _u32(value: int) -> bytes:
