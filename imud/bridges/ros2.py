@@ -210,8 +210,8 @@ def _parts_of(name: str) -> list[str]:
 
 NO_FIX, FIX, SBAS_FIX, GBAS_FIX = -1, 0, 1, 2  # `status` of sensor_msgs/NavSatStatus
 # Status by the quality of a position. ROS has no status for a position that is not measured with satellites: dead
-# reckoning (6), manual (7) and simulation (8) have NO_FIX. RTK, float and fixed, uses a station on the ground.
-FIX_STATUS: Final = {0: NO_FIX, 1: FIX, 2: SBAS_FIX, 3: FIX, 4: GBAS_FIX, 5: GBAS_FIX, 6: NO_FIX, 7: NO_FIX, 8: NO_FIX}
+# reckoning (6), manual (7) and simulation (8) have NO_FIX. RTK (4, 5) uses a station on the ground.
+FIX_STATUS: Final = {1: FIX, 2: SBAS_FIX, 3: FIX, 4: GBAS_FIX, 5: GBAS_FIX}  # all others: NO_FIX
 LEVEL_INFO: Final = 20
 LEVEL_WARN: Final = 30
 SEC_MAX: Final = 0x7FFF_FFFF  # maximum `sec` of `builtin_interfaces/Time`, in the year 2038

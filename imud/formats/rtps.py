@@ -114,7 +114,8 @@ def gap(writer: bytes, reader: bytes, numbers: Sequence[int]) -> bytes:
     """Return the statement that these sequence numbers are not available: at least one, in ascending order, in a range
     of at most BITS_MAX numbers."""
     start = numbers[0]
-    body = struct.pack("<4s4siI", reader, writer, start >> 32, start & _LOW_MASK) + _number_set(start + 1, numbers[1:])
+    body = struct.pack("<4s4siI", reader, writer, start >> 32, start & _LOW_MASK)
+    body += _number_set(start + 1, numbers[1:])
     return struct.pack("<BBH", GAP, 1, len(body)) + body
 
 
@@ -128,8 +129,8 @@ def _number_set(base: int, numbers: Sequence[int]) -> bytes:
     """Return a SequenceNumberSet (section 9.4.2.6): `base`, the number of bits, and the bits."""
     count = numbers[-1] - base + 1 if numbers else 0
     bits = [0] * ((count + 31) // 32)
-    for number in numbers:
-        bits[(number - base) // 32] |= 1 << (31 - (number - base) % 32)
+    for seq in numbers:
+        bits[(seq - base) // 32] |= 1 << (31 - (seq - base) % 32)
     return struct.pack(f"<iII{len(bits)}I", base >> 32, base & _LOW_MASK, count, *bits)
 
 
@@ -195,7 +196,7 @@ class ReceivedGap:
     writer: bytes
     start: int
     end: int  # first sequence number after the gap
-    others: Sequence[int]  # further sequence numbers that are not available
+    more_numbers: Sequence[int]  # further sequence numbers that are not available
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,7 +242,8 @@ class RtpsReader:
         offset = HEADER_BYTES
         is_mine = True
         while offset + 4 <= len(datagram):
-            kind, flags = datagram[offset], datagram[offset + 1]
+            kind = datagram[offset]
+            flags = datagram[offset + 1]
             order = "<" if flags & 1 else ">"
             (size,) = struct.unpack_from(order + "H", datagram, offset + 2)
             # length 0: to the end of the datagram, except for PAD and INFO_TS (section 9.4.5.1.3)
@@ -263,7 +265,7 @@ def _data(body: bytes, flags: int, order: str) -> ReceivedData | None:
     to_inline, _reader, writer, high, low = struct.unpack_from(order + "xxH4s4siI", body)
     if writer not in (PARTICIPANT_WRITER, SUBSCRIPTIONS_WRITER):
         return None
-    seq = _number(high, low)
+    seq = _read_seq(high, low)
     at, key, status = 4 + to_inline, b"", 0
     if flags & 0x02:
         inline, at = _parameters(body, at, order)
@@ -281,8 +283,8 @@ def _heartbeat(body: bytes, flags: int, order: str) -> ReceivedHeartbeat | None:
     _reader, writer, high, low, last_high, last_low = struct.unpack_from(order + "4s4siIiI", body)
     if writer != SUBSCRIPTIONS_WRITER:
         return None
-    first = max(1, _number(high, low, minimum=0))  # older participants announce an empty writer with 0
-    last = _number(last_high, last_low, minimum=0)
+    first = max(1, _read_seq(high, low, minimum=0))  # older participants announce an empty writer with 0
+    last = _read_seq(last_high, last_low, minimum=0)
     if last < first - 1:
         raise ValueError
     return ReceivedHeartbeat(writer, first, last, bool(flags & 2))
@@ -292,11 +294,11 @@ def _gap(body: bytes, _flags: int, order: str) -> ReceivedGap | None:
     _reader, writer, high, low = struct.unpack_from(order + "4s4siI", body)
     if writer != SUBSCRIPTIONS_WRITER:
         return None
-    start = _number(high, low)
-    end, others = _read_number_set(body, 16, order, minimum=1)
+    start = _read_seq(high, low)
+    end, more_numbers = _read_number_set(body, 16, order, minimum=1)
     if end < start:
         raise ValueError
-    return ReceivedGap(writer, start, end, others)
+    return ReceivedGap(writer, start, end, more_numbers)
 
 
 def _acknack(body: bytes, flags: int, order: str) -> ReceivedAckNack:
@@ -309,18 +311,18 @@ def _acknack(body: bytes, flags: int, order: str) -> ReceivedAckNack:
 _READ: Final = {DATA: _data, HEARTBEAT: _heartbeat, GAP: _gap, ACKNACK: _acknack}
 
 
-def _number(high: int, low: int, *, minimum: int = 1) -> int:
+def _read_seq(high: int, low: int, *, minimum: int = 1) -> int:
     """Return a sequence number. Raises ValueError if it is out of range."""
-    number = (high << 32) + low
-    if not minimum <= number <= SEQ_MAX:
+    seq = (high << 32) + low
+    if not minimum <= seq <= SEQ_MAX:
         raise ValueError
-    return number
+    return seq
 
 
 def _read_number_set(body: bytes, offset: int, order: str, *, minimum: int) -> tuple[int, Sequence[int]]:
     """Return the base of a SequenceNumberSet and its numbers. Raises ValueError, struct.error."""
     high, low, count = struct.unpack_from(order + "iII", body, offset)
-    base = _number(high, low, minimum=minimum)
+    base = _read_seq(high, low, minimum=minimum)
     if count > BITS_MAX:
         raise ValueError
     words = struct.unpack_from(f"{order}{(count + 31) // 32}I", body, offset + 12)

@@ -60,7 +60,7 @@ class RtpsNetwork:
         self._header = rtps.header(self.prefix)
         self._used: list[InterfaceAddress] = []  # addresses of this participant
         self._members: set[int] = set()  # indexes of the interfaces on which the socket is a member of the group
-        self._checked: dict[str, bool] = {}  # results of `is_reachable`
+        self._reachable_addresses: dict[str, bool] = {}  # results of `is_reachable`
         self.port = 0
         self.budget = WorkBudget(INPUT_LIMITS, cpu_ns)
         self._samples = WorkBudget(SAMPLE_LIMITS, cpu_ns)
@@ -140,7 +140,7 @@ class RtpsNetwork:
                 )
         if self._used == previous:
             return False
-        self._checked.clear()
+        self._reachable_addresses.clear()
         return True
 
     def _select_interfaces(self) -> list[InterfaceAddress]:
@@ -149,15 +149,15 @@ class RtpsNetwork:
         interfaces = self._interfaces()
         own_address = self._own_address
         if own_address is not None:
-            same = [interface for interface in interfaces if interface.address == own_address]
+            matches = [interface for interface in interfaces if interface.address == own_address]
             # each address of its network belongs to a loopback interface
-            return same or [
+            return matches or [
                 interface._replace(address=own_address)
                 for interface in interfaces
                 if interface.is_loopback and IPv4Address(own_address) in interface.network
             ]
-        others = [interface for interface in interfaces if interface.has_multicast and not interface.is_loopback]
-        return others or [interface for interface in interfaces if interface.is_loopback]
+        multicast = [interface for interface in interfaces if interface.has_multicast and not interface.is_loopback]
+        return multicast or [interface for interface in interfaces if interface.is_loopback]
 
     def _join(self, interface: InterfaceAddress) -> bool:
         """Return whether the socket is a member of the group on this interface. A membership belongs to the interface:
@@ -182,11 +182,11 @@ class RtpsNetwork:
 
     def is_reachable(self, address: str) -> bool:
         """Return whether an address is a host address in a network of imud."""
-        is_reachable = self._checked.get(address)
+        is_reachable = self._reachable_addresses.get(address)
         if is_reachable is None:
-            if len(self._checked) >= CHECKED_ADDRESSES_MAX:
-                self._checked.clear()
-            is_reachable = self._checked[address] = self._check(address)
+            if len(self._reachable_addresses) >= CHECKED_ADDRESSES_MAX:
+                self._reachable_addresses.clear()
+            is_reachable = self._reachable_addresses[address] = self._check(address)
         return is_reachable
 
     def is_own(self, address: str) -> bool:
@@ -239,14 +239,14 @@ class RtpsNetwork:
 
     def close(self) -> None:
         """Close both sockets. A second call does nothing."""
-        for each in (self._unicast, self._multicast):
-            if each is not None:
-                each.close()
+        for udp_socket in (self._unicast, self._multicast):
+            if udp_socket is not None:
+                udp_socket.close()
         self._unicast = None
         self._multicast = None
         self._used = []
         self._members.clear()
-        self._checked.clear()
+        self._reachable_addresses.clear()
 
 
 def _member(interface: InterfaceAddress) -> bytes:

@@ -60,7 +60,7 @@ class RtpsParticipant:
         self._described: dict[bytes, int] = {}  # sequence number of the description of each writer
         self._entities = 0
         self._announce_ns = 0
-        self._network_ns = 0  # time of the next read of the addresses of this host
+        self._network_ns = 0  # time at which this participant reads the host's addresses again
         self._announced = 0
         self._sockets: tuple[socket.socket, ...] = ()
         self._is_reading = False
@@ -110,16 +110,16 @@ class RtpsParticipant:
         if self._sockets and not self._is_reading:
             self._is_reading = True
             loop = asyncio.get_running_loop()
-            for each in self._sockets:
-                loop.add_reader(each.fileno(), self._read, each)
+            for udp_socket in self._sockets:
+                loop.add_reader(udp_socket.fileno(), self._read, udp_socket)
 
     def _stop_reading(self) -> None:
         """Leave the datagrams in the kernel, which discards them if its queue is full. The next tick reads again."""
         if self._is_reading:
             self._is_reading = False
             loop = asyncio.get_running_loop()
-            for each in self._sockets:
-                loop.remove_reader(each.fileno())
+            for udp_socket in self._sockets:
+                loop.remove_reader(udp_socket.fileno())
 
     def add(self, topic: str, type_name: str, type_hash: str, *, is_kept: bool = False) -> RtpsWriter:
         """Add a writer, announce it, and match it with the known readers."""
@@ -186,7 +186,7 @@ class RtpsParticipant:
         self._sockets = ()
         self._network.close()
 
-    def _read(self, source_socket: socket.socket) -> None:
+    def _read(self, udp_socket: socket.socket) -> None:
         now_ns = self._now_ns()
         budget = self._network.budget
         self._network.start_turn(now_ns)
@@ -194,7 +194,7 @@ class RtpsParticipant:
             if budget.is_turn_over:
                 break
             try:
-                datagram, (source, _port) = source_socket.recvfrom(DATAGRAM_BYTES)
+                datagram, (source, _port) = udp_socket.recvfrom(DATAGRAM_BYTES)
             except OSError:  # no data, or an ICMP error of an earlier datagram
                 break
             self._process(datagram, source, now_ns)
@@ -240,7 +240,7 @@ class RtpsParticipant:
     def _of_peer(self, peer: RtpsPeer, submessage: rtps.Submessage, now_ns: int) -> None:
         """Process a submessage of a known participant."""
         if isinstance(submessage, ReceivedAckNack):
-            self._acknowledged(peer, submessage)
+            self._acknowledge(peer, submessage)
         elif isinstance(submessage, ReceivedHeartbeat):
             peer.skip_to(submessage.first)
             peer.last = submessage.last
@@ -250,12 +250,12 @@ class RtpsParticipant:
             if submessage.start <= peer.next_seq:
                 peer.skip_to(submessage.end)
             peer.arrive(range(max(submessage.start, peer.next_seq), min(submessage.end, peer.next_seq + WINDOW)))
-            peer.arrive(submessage.others)
+            peer.arrive(submessage.more_numbers)
         else:
             self._subscription(peer, submessage, now_ns)
 
     def _send_receipt(self, peer: RtpsPeer) -> None:
-        """Acknowledge the descriptions of readers and request the missing ones."""
+        """Acknowledge the descriptions of readers and request the missing descriptions."""
         peer.counts += 1
         receipt = rtps.acknack(
             rtps.SUBSCRIPTIONS_READER, rtps.SUBSCRIPTIONS_WRITER, peer.next_seq, peer.missing(peer.last), peer.counts
@@ -306,6 +306,7 @@ class RtpsParticipant:
             if self._peers.announce(peer, found, source, now_ns):
                 self._connect(peer, now_ns)
             return
+
         limit = self._peers.find_limit(source)
         if limit:
             self._refuse(
@@ -317,6 +318,7 @@ class RtpsParticipant:
             if silent is None:
                 return
             self._forget(silent)
+
         peer = RtpsPeer(found, source, now_ns)
         self._peers.add(peer)
         self._network.reply(self._announcement(), peer.meta)
@@ -385,7 +387,7 @@ class RtpsParticipant:
                 limit = f"{writer.ports_max} ports of one address and {writer.destinations_max} destinations of a topic"
                 self._refuse_reader(peer, limit, now_ns)
 
-    def _acknowledged(self, peer: RtpsPeer, received: ReceivedAckNack) -> None:
+    def _acknowledge(self, peer: RtpsPeer, received: ReceivedAckNack) -> None:
         guid = peer.prefix + received.reader
         writer = self._writers.get(received.writer)
         if received.writer == rtps.PUBLICATIONS_WRITER:

@@ -3,7 +3,7 @@
     announcement from S ──▶ S announced, or the only address? ──▶ imud sends to S, at the announced port
 
 A participant is its GUID. imud sends only to the address from which the participant itself sends: an announcement of
-the address of a third host causes nothing there. If a participant sends from a new address, imud follows.
+the address of a third host causes no datagram to that host. If a participant sends from a new address, imud follows.
 """
 
 from collections import Counter
@@ -20,21 +20,21 @@ ADDRESS_PEERS_MAX: Final = 128  # maximum number of participants of one address:
 READERS_MAX: Final = 4096  # maximum number of readers of all participants
 PEER_READERS_MAX: Final = 256  # maximum number of readers of one participant: a process with many nodes
 ADDRESS_READERS_MAX: Final = 2048  # maximum number of readers of one address: half, so that others have room
-# Maximum time without a datagram of a participant, whatever lease it announces: two announcements of RTI Connext and
-# OpenDDS (30 s). Fast DDS announces itself every 3 s, Cyclone DDS every 8 s.
+# Maximum lease, also if a participant announces a longer lease: two announcements of RTI Connext and OpenDDS (30 s).
+# Fast DDS announces itself every 3 s, Cyclone DDS every 8 s.
 LEASE_MAX_S: Final = 60
 SILENT_NS: Final = 20 * NS_PER_S  # time without a datagram after which a participant makes room for a new one
 ADDRESS_NS: Final = 5 * NS_PER_S  # time without a datagram after which another announced address replaces an address
-WINDOW: Final = rtps.BITS_MAX  # sequence numbers after the first missing one that imud notes: those of one request
+WINDOW: Final = rtps.BITS_MAX  # number of sequence numbers that imud notes after the first missing number: one request
 
 
 @dataclass(slots=True)
 class RtpsPeer:
     """Another participant."""
 
-    found: FoundParticipant
+    description: FoundParticipant  # newest announcement
     address: str  # address from which it sends, and to which imud sends
-    heard_ns: int  # time of its newest datagram from this address
+    received_ns: int  # time of its newest datagram from this address
     readers: dict[bytes, FoundReader] = field(default_factory=dict)
     is_confirmed: bool = False  # whether it has acknowledged messages of imud
     next_seq: int = 1  # all descriptions of readers below this sequence number have arrived
@@ -44,21 +44,21 @@ class RtpsPeer:
 
     @property
     def prefix(self) -> bytes:
-        return self.found.guid[: rtps.PREFIX_BYTES]
+        return self.description.guid[: rtps.PREFIX_BYTES]
 
     @property
     def until_ns(self) -> int:
         """Time at which imud forgets the participant if no datagram arrives."""
-        return self.heard_ns + min(self.found.lease_s, LEASE_MAX_S) * NS_PER_S
+        return self.received_ns + min(self.description.lease_s, LEASE_MAX_S) * NS_PER_S
 
     @property
     def meta(self) -> Locator:
         """Destination of discovery messages."""
-        return self._destination(self.found.meta)
+        return self._destination(self.description.meta)
 
     def destination(self, reader: FoundReader) -> Locator:
         """Return the destination of samples for a reader."""
-        return self._destination(reader.locators or self.found.default)
+        return self._destination(reader.locators or self.description.default)
 
     def _destination(self, locators: Sequence[Locator]) -> Locator:
         """Return the announced destination at the address of the participant. If it did not announce this address (a
@@ -72,20 +72,20 @@ class RtpsPeer:
         """Return whether the participant has this address."""
         if source == self.address:
             return True
-        return any(locator.address == source for locator in (*self.found.meta, *self.found.default))
+        return any(locator.address == source for locator in (*self.description.meta, *self.description.default))
 
-    def announce(self, found: FoundParticipant, source: str, now_ns: int) -> bool:
+    def announce(self, description: FoundParticipant, source: str, now_ns: int) -> bool:
         """Process an announcement. Return whether the destinations changed."""
-        old = (self.address, self.found.meta, self.found.default)
-        self.found = found
-        is_announced = any(locator.address == self.address for locator in (*found.meta, *found.default))
-        is_new_announced = any(locator.address == source for locator in (*found.meta, *found.default))
-        is_recent = now_ns - self.heard_ns <= ADDRESS_NS
+        old = (self.address, self.description.meta, self.description.default)
+        self.description = description
+        is_announced = any(locator.address == self.address for locator in (*description.meta, *description.default))
+        is_new_announced = any(locator.address == source for locator in (*description.meta, *description.default))
+        is_recent = now_ns - self.received_ns <= ADDRESS_NS
         # a host with two networks announces both addresses, and sends from both
         if source == self.address or not (is_recent and (is_announced or not is_new_announced)):
             self.address = source
-            self.heard_ns = now_ns
-        return (self.address, found.meta, found.default) != old
+            self.received_ns = now_ns
+        return (self.address, description.meta, description.default) != old
 
     def arrive(self, numbers: Iterable[int]) -> None:
         """Note descriptions or gaps. Ignore a number after the window: imud requests it later."""
@@ -130,7 +130,7 @@ class PeerTable:
         if peer is None or not peer.sends_from(source):
             return None
         if source == peer.address:
-            peer.heard_ns = now_ns
+            peer.received_ns = now_ns
         return peer
 
     def find_limit(self, address: str) -> str:
@@ -140,16 +140,16 @@ class PeerTable:
         return f"{PEERS_MAX} participants" if len(self._peers) >= PEERS_MAX else ""
 
     def find_silent(self, address: str, now_ns: int) -> RtpsPeer | None:
-        """Return the participant that makes room for a new one of this address: of the participants that did not
-        confirm, or are silent, the one with the oldest datagram. None if all are active."""
+        """Return the participant that makes room for a new participant of this address: the participant with the oldest
+        datagram that did not confirm or is silent. None if all are active."""
         is_any_address = not self._is_full_for(address)
         peers = [
             peer
             for peer in self._peers.values()
             if (is_any_address or peer.address == address)
-            and (not peer.is_confirmed or now_ns - peer.heard_ns > SILENT_NS)
+            and (not peer.is_confirmed or now_ns - peer.received_ns > SILENT_NS)
         ]
-        return min(peers, key=lambda peer: peer.heard_ns, default=None)
+        return min(peers, key=lambda peer: peer.received_ns, default=None)
 
     def _is_full_for(self, address: str) -> bool:
         return sum(peer.address == address for peer in self._peers.values()) >= ADDRESS_PEERS_MAX
@@ -162,10 +162,10 @@ class PeerTable:
         del self._peers[peer.prefix]
         self._count_readers(peer.address, -len(peer.readers))
 
-    def announce(self, peer: RtpsPeer, found: FoundParticipant, source: str, now_ns: int) -> bool:
+    def announce(self, peer: RtpsPeer, description: FoundParticipant, source: str, now_ns: int) -> bool:
         """Process an announcement of a known participant. Return whether its destinations changed."""
         address = peer.address
-        has_changed = peer.announce(found, source, now_ns)
+        has_changed = peer.announce(description, source, now_ns)
         self._count_readers(address, -len(peer.readers))
         self._count_readers(peer.address, len(peer.readers))
         return has_changed
@@ -184,7 +184,7 @@ class PeerTable:
         return ""
 
     def remove_reader(self, peer: RtpsPeer, guid: bytes) -> FoundReader | None:
-        """Remove and return a reader; None if the participant does not have it."""
+        """Remove and return a reader; None if the participant has no such reader."""
         reader = peer.readers.pop(guid, None)
         if reader is not None:
             self._count_readers(peer.address, -1)

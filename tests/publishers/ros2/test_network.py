@@ -120,4 +120,4 @@ def test_results_for_addresses_are_bounded() -> None:
     host = Host(interface("192.0.2.1/24"))
     for number in range(5000):
         host.network.is_reachable(f"10.0.{number // 250}.{number % 250}")
-    assert len(host.network._checked) <= 1024
+    assert len(host.network._reachable_addresses) <= 1024
