@@ -1,8 +1,11 @@
 """Sockets of a participant: memberships of the multicast group, and the networks to which imud sends."""
 
 import errno
+import os
 import socket
 import struct
+import subprocess
+import sys
 from typing import Any, cast
 
 import pytest
@@ -121,3 +124,29 @@ def test_results_for_addresses_are_bounded() -> None:
     for number in range(5000):
         host.network.is_reachable(f"10.0.{number // 250}.{number % 250}")
     assert len(host.network._reachable_addresses) <= 1024
+
+
+PROGRAM = """
+import subprocess
+from imud.publishers.ros2.network import RtpsNetwork
+
+network = RtpsNetwork(0, None)
+network.open()
+for old, new in (("192.0.2.1", "192.0.2.5"), ("192.0.2.5", "198.51.100.7")):
+    subprocess.run(["ip", "addr", "del", f"{old}/24", "dev", "net0"], check=True)
+    subprocess.run(["ip", "addr", "add", f"{new}/24", "dev", "net0"], check=True)
+    has_changed = network.refresh()
+    network.multicast(b"")
+    print(has_changed, [locator.address for locator in network.locators], repr(network.problem(0)))
+"""
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root for a network of its own")
+def test_a_change_of_the_address_with_the_kernel() -> None:
+    """The kernel keeps the membership of an interface that loses its address."""
+    setup = "ip link add net0 type veth peer net1 && ip addr add 192.0.2.1/24 dev net0 && ip link set net0 up"
+    command = ["unshare", "-n", "sh", "-c", f'{setup} && exec "$0" -c "$1"', sys.executable, PROGRAM]
+    output = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    if output.returncode and "net0" not in output.stdout and "Traceback" not in output.stderr:
+        pytest.skip(f"cannot create a network: {output.stderr.strip()}")
+    assert output.stdout.splitlines() == ["True ['192.0.2.5'] ''", "True ['198.51.100.7'] ''"], output.stderr
