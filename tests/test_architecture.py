@@ -505,6 +505,8 @@ TESTED_IN = {
     "imud.drivers.imu61x.registers": "drivers/imu61x/test_i2c.py",
     "imud.drivers.imu61x.uart.driver": "drivers/imu61x/uart/test_commands.py",
     "imud.drivers.polled_frames": "drivers/test_every_polled_driver.py",
+    "imud.drivers.state": "sampling/test_state.py", "imud.drivers.hipnuc.assembly_state": "sampling/test_state.py",
+    "imud.sampling.fit_state": "sampling/test_state.py", "imud.sampling.aiding_state": "sampling/test_state.py",
     "imud.fleet.settings": "fleet/test_publisher.py", "imud.fleet.database.tables": "fleet/database/test_rows.py",
     "imud.links.cyclic_sender": "links/test_socketcan.py", "imud.host.netlink": "links/test_socketcan.py",
     "imud.model.bucket": "publishers/socket/test_history.py",

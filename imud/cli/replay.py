@@ -93,7 +93,7 @@ def play_to_end(file: BinaryIO, name: str, player: Player) -> tuple[str, int]:
     player.play(reader)
     devices = player.all_devices
     report = "\n\n".join(["\n".join(device_block(device)) for device in devices] + remarks(reader, player))
-    same = all(not device.differences for device in devices) and not player.lost and not reader.is_damaged
+    same = all(not device.different_checks for device in devices) and not player.lost and not reader.is_damaged
     return report, 0 if same and any(device.ledger.samples for device in devices) else 1
 
 
@@ -102,17 +102,19 @@ def device_block(device: PlayedDevice, without: Collection[str] = ()) -> list[st
     counts, before = device.ledger.snapshot(), device.before or {}
     own = {name: count - before.get(name, 0) for name, count in counts.items()}  # without the run before the recording
     path = device.path
-    newest = path.newest if path is not None else None
+    newest = path.newest if path is not None else device.newest
+    rate_hz = path.clock.expected_rate_hz if path is not None else device.rate_hz
+    unknown = path.unknown if path is not None else device.unknown
     clock = f"{newest.sync}, error {newest.t_err_ns / NS_PER_MS:.3f} ms" if newest is not None else "no sample"
-    if path is not None and path.clock.expected_rate_hz:
-        clock += f", {path.clock.expected_rate_hz:.1f} Hz by the device's clock"
+    if rate_hz:
+        clock += f", {rate_hz:.1f} Hz by the device's clock"
     closes = not bytes_open(counts) and not frames_open(counts)
     driver, words = device.driver, ""
-    if driver is not None and path is not None and path.unknown:
+    if driver is not None and unknown:
         if not counts["samples"]:
-            words = driver.unknown_words(path.unknown, device.described.name, counted=True)
+            words = driver.unknown_words(unknown, device.described.name, counted=True)
         elif isinstance(driver, StreamDriver):
-            words = driver.unknown_types(path.unknown)
+            words = driver.unknown_types(unknown)
     odd = wrong_length_words(device.ledger, device.wrong_length)
     rows = [
         ("link", f"{device.described.where}, driver {device.driver.name if device.driver else 'unknown'}"),
@@ -136,9 +138,9 @@ def comparison(device: PlayedDevice) -> str:
             f"the time stamps differ from the live run: {device.fresh_starts[0]}; the clock restarted, and its error "
             "is larger for some seconds"
         )
-    if not device.differences:
+    if not device.different_checks:
         return f"equal to the live run at {device.checks} of {device.checks} checks"
-    return f"DIFFERENT from the live run at {len(device.differences)} of {device.checks} checks: " + "; ".join(
+    return f"DIFFERENT from the live run at {device.different_checks} of {device.checks} checks: " + "; ".join(
         device.differences[:DIFFERENCES_SHOWN]
     )
 

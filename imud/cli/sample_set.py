@@ -283,8 +283,8 @@ def _describe(sample_set: SampleSet, player: Player, name: str) -> None:
     sample_set.link, sample_set.identity = device.described.where, device.described.identity
     sample_set.settings = device.described.settings
     sample_set.notes += [f"clock: {why}" for why in device.fresh_starts[:1]]
-    if device.differences:
-        sample_set.notes.append(f"replay: {len(device.differences)} of {device.checks} checks differ")
+    if device.different_checks:
+        sample_set.notes.append(f"replay: {device.different_checks} of {device.checks} checks differ")
 
 
 def take_capture(args: argparse.Namespace) -> SampleSet:

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cache, cached_property
 from importlib import import_module
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar, cast
 
 if TYPE_CHECKING:
@@ -19,13 +20,14 @@ INTERFACE_VERSION: Final = 1
 """Version of the interface for other packages. A change that breaks the code of such a package increments it."""
 PLUGINS_VARIABLE: Final = "IMUD_PLUGINS"  # environment variable: with the value `off`, imud ignores other packages
 PLUGIN_NAME: Final = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
+ROW: Final = re.compile(r"[a-z_][a-z0-9_.]*:[A-Za-z_][A-Za-z0-9_]*")  # row of a registry: module and name
 _PREFIX: Final = "imud."  # start of the names of all groups
 
 T = TypeVar("T")
 
 
 def load(row: str) -> Any:
-    """Import and return the object `module:NAME`."""
+    """Import and return the object `module:NAME` of a row in the code. Never call it with a name from outside."""
     module, _, attribute = row.partition(":")
     return getattr(import_module(module), attribute)
 
@@ -88,11 +90,19 @@ def problems_of(table: Mapping[str, Any]) -> Mapping[str, str]:
 
 class Registry(Mapping[str, T], Generic[T]):
     """Mapping from a name to the object of its row. A new part needs one module and one row. Raises KeyError for an
-    unknown name; the message lists the known names."""
+    unknown name; the message lists the known names.
+
+    A name can come from a configuration, a recording or a peer. It only selects a row of the fixed table, or an entry
+    point of an installed package. It is never the name of a module.
+    """
 
     def __init__(self, kind: str, rows: Mapping[str, str], group: PluginGroup | None = None) -> None:
+        """Raises ValueError for a row of another form than `module:NAME`."""
+        for name, row in rows.items():
+            if not PLUGIN_NAME.fullmatch(name) or not ROW.fullmatch(row):
+                raise ValueError(f"{kind} {name}: expected a row `module:NAME`, got {row!r}")
         self.kind = kind
-        self.rows = dict(rows)
+        self.rows: Final = MappingProxyType(dict(rows))
         self._group = group
         self._modules: dict[str, str] = {}  # module of each row of another package
 

@@ -1,11 +1,15 @@
 """Decoder for frames of a polled device: absent, damaged, stale (same bytes as before), or a new measurement."""
 
 from collections.abc import Callable, Sequence
+from typing import ClassVar, Final
 
 from imud.contracts.codec import BadFrame, BadReason, PolledEvent, Vanished
+from imud.drivers.state import COUNT, DAEMON
+from imud.formats.state import Data, Field, StateTable
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 
+FRAME_BYTES_MAX: Final = 512  # maximum size of a frame in a recorded state, bytes: more than a reply of Modbus
 Measured = tuple[Measurement, bool]  # a measurement, and whether all its values were finite
 
 
@@ -14,6 +18,11 @@ class PolledFrameDecoder:
 
     The ledger counts a stale frame as good and ignored, and a frame of an absent device as skipped bytes.
     """
+
+    STATE: ClassVar = StateTable(
+        (Field(1, "stale", COUNT), Field(2, "_last", Data(FRAME_BYTES_MAX))),
+        {"_ledger": DAEMON, "_size_bytes": "set by the constructor"},
+    )
 
     def __init__(self, ledger: Ledger, size_bytes: int) -> None:
         self.stale = 0  # number of good frames with the same bytes as the previous frame

@@ -17,6 +17,7 @@ from enum import IntEnum
 from typing import Annotated, Any, Final, NamedTuple
 
 import msgspec
+from msgspec import Meta
 
 from imud.formats.can import CanFrame
 from imud.model.errors import ImudError, reason_of
@@ -76,8 +77,8 @@ class SessionRecord(msgspec.Struct, frozen=True):
 
 
 # A name outside this pattern is forged: it could control the terminal of a program that prints it
-DeviceName = Annotated[str, msgspec.Meta(pattern=rf"^{DEVICE_NAME_PATTERN}\Z")]
-DeviceNameOrEmpty = Annotated[str, msgspec.Meta(pattern=rf"^({DEVICE_NAME_PATTERN})?\Z")]
+DeviceName = Annotated[str, Meta(pattern=rf"^{DEVICE_NAME_PATTERN}\Z")]
+DeviceNameOrEmpty = Annotated[str, Meta(pattern=rf"^({DEVICE_NAME_PATTERN})?\Z")]
 
 
 class DeviceRecord(msgspec.Struct, frozen=True):
@@ -92,13 +93,23 @@ class DeviceRecord(msgspec.Struct, frozen=True):
     settings: dict[str, str]
 
 
+# Maximum absolute value of a time, ns: 73 years. Sums and differences of two times then have 64 bits. Times of a replay
+# can be negative.
+TIME_MAX_NS: Final = 1 << 61
+UTC_OFFSET_MAX_NS: Final = 1 << 62  # maximum of CLOCK_REALTIME minus CLOCK_MONOTONIC, ns: until the year 2116
+COUNT_MAX: Final = 1 << 53  # maximum of a counter
+PERIOD_MAX_NS: Final = 3_600_000_000_000  # maximum time between two reads of a polled device, ns
+Time = Annotated[int, Meta(ge=-TIME_MAX_NS, le=TIME_MAX_NS)]
+Count = Annotated[int, Meta(ge=0, le=COUNT_MAX)]
+
+
 class PathRecord(msgspec.Struct, frozen=True):
     """Codec and clock for the following records."""
 
     driver: str
     options: dict[str, Any]
-    period_ns: int  # time between two reads of a polled device, ns
-    ledger: dict[str, int]
+    period_ns: Annotated[int, Meta(ge=0, le=PERIOD_MAX_NS)]  # time between two reads of a polled device, ns
+    ledger: dict[str, Count]
     state: bytes  # state of codec, clock and path (`imud.recording.state`); empty if imud cannot save the state
 
 
@@ -156,11 +167,11 @@ class CallRecord(msgspec.Struct, frozen=True, array_like=True):
 class CheckRecord(msgspec.Struct, frozen=True):
     """Expected state of a replay at this place."""
 
-    t_ns: int  # CLOCK_MONOTONIC
+    t_ns: Time  # CLOCK_MONOTONIC
     seq: int
     sample_t_ns: int
     sample_t_err_ns: int  # error of the newest sample; 0 without a sample
-    ledger: dict[str, int]
+    ledger: dict[str, Count]
 
     def __post_init__(self) -> None:
         """Raise ValueError if the ledger lacks a counter of lost samples."""
@@ -185,6 +196,10 @@ class EndRecord(msgspec.Struct, frozen=True):
 
 
 LINES: Final = ("sout", "sout_div", "pps", "data_ready", "alarm")  # Lines, by their number in an EDGES record
+
+# Maximum size of a MessagePack body: a state of 1 MiB and the configuration of a device. Python needs up to 75 bytes of
+# memory for one byte.
+OBJECT_BYTES_MAX: Final = 5 << 18
 
 _encode: Final = msgspec.msgpack.Encoder().encode
 
@@ -254,6 +269,9 @@ def records_of(content: bytes) -> Iterator[Record]:
 
 def decode_object(record: Record, type_: type[Any]) -> Any:
     """Return the body of a record as `type_`. Raises ImudError for invalid bytes."""
+    if len(record.body) > OBJECT_BYTES_MAX:
+        got = f"expected at most {OBJECT_BYTES_MAX} bytes, got {len(record.body)}"
+        raise ImudError(f"cannot read a record of kind {record.kind}: {got}")
     try:
         return msgspec.msgpack.decode(record.body, type=type_)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -264,6 +282,7 @@ def decode_data(body: bytes) -> DataRecord:
     """Return the body of a DATA record. Raises ImudError."""
     _check_length(body, _DATA.size, "bytes")
     t_rx_ns, waited_ns, _ = _DATA.unpack_from(body)
+    _check_times(t_rx_ns, waited_ns)
     return DataRecord(t_rx_ns, waited_ns, body[_DATA.size :])
 
 
@@ -275,6 +294,7 @@ def decode_frames(body: bytes) -> list[CanFrame]:
         t_rx_ns, can_id, flags, length = _FRAME.unpack_from(body, at)
         at += _FRAME.size + length
         _check_length(body, at, "frames")
+        _check_times(t_rx_ns)
         data = body[at - length : at]
         frames.append(CanFrame(can_id, bool(flags & _EXTENDED), data, t_rx_ns, bool(flags & _AFTER_LOSS)))
     return frames
@@ -288,6 +308,7 @@ def decode_readings(body: bytes) -> list[ReadingRecord]:
         start_ns, end_ns, poll, trouble, length = _READING.unpack_from(body, at)
         at += _READING.size + length
         _check_length(body, at, "readings")
+        _check_times(start_ns, end_ns)
         readings.append(ReadingRecord(poll, start_ns, end_ns, trouble, body[at - length : at]))
     return readings
 
@@ -298,19 +319,31 @@ def decode_edges(body: bytes) -> EdgesRecord:
     if body[0] >= len(LINES) or (len(body) - 1) % _EDGE.size:
         raise ImudError(f"cannot read edges: line {body[0]}, {len(body) - 1} bytes")
     edges = [EdgeRecord(t_ns, bool(rising), number) for t_ns, rising, number in _EDGE.iter_unpack(body[1:])]
+    _check_times(*(edge.t_ns for edge in edges))
     return EdgesRecord(LINES[body[0]], edges)
 
 
 def decode_clocks(body: bytes) -> ClocksRecord:
     """Return a reading of the clocks. Raises ImudError."""
     _check_length(body, _CLOCKS.size, "clocks")
-    return ClocksRecord(*_CLOCKS.unpack_from(body))
+    clocks = ClocksRecord(*_CLOCKS.unpack_from(body))
+    _check_times(clocks.monotonic_ns, clocks.raw_ns, clocks.held_raw_ns, clocks.error_ns)
+    if clocks.error_ns < 0 or abs(clocks.utc_offset_ns) > UTC_OFFSET_MAX_NS:
+        expected = f"expected an error of 0 or more and an offset of at most {UTC_OFFSET_MAX_NS} ns"
+        raise ImudError(f"cannot read clocks: {expected}, got {clocks.error_ns} and {clocks.utc_offset_ns}")
+    return clocks
 
 
 def decode_lost(body: bytes) -> LostRecord:
     """Return the number of lost records. Raises ImudError."""
     _check_length(body, _LOST.size, "lost records")
     return LostRecord(*_LOST.unpack_from(body))
+
+
+def _check_times(*times_ns: int) -> None:
+    for time_ns in times_ns:
+        if not -TIME_MAX_NS <= time_ns <= TIME_MAX_NS:
+            raise ImudError(f"cannot read a record: expected times of at most {TIME_MAX_NS} ns, got {time_ns}")
 
 
 def _check_length(body: bytes, expected: int, what: str) -> None:

@@ -38,6 +38,10 @@ class SteadyTime:
     __slots__ = ("_base_ns", "_even", "_monotonic", "_offsets", "_steady", "even_from_ns", "offset_ns")
 
     def __init__(self) -> None:
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all pairs."""
         self.offset_ns = 0  # CLOCK_MONOTONIC minus steady time at the newest pair
         # Steady time after which `offset_ns` is exact within 1 µs. Later times need no call.
         self.even_from_ns = -1 << 63

@@ -18,12 +18,14 @@ from imud.contracts.publisher import PutRecord
 from imud.formats import records
 from imud.formats.can import CanFrame
 from imud.formats.records import CallRecord, CheckRecord, ClocksRecord, DeviceRecord, Kind, PathRecord
+from imud.formats.state import StateError
 from imud.host.clock import HostClock
 from imud.model.errors import Trouble
 from imud.model.ledger import Ledger
 from imud.model.options import Options
-from imud.recording.state import StateError, StateWriter
+from imud.recording.calls import HostState
 from imud.sampling.path import PolledPath, SamplePath
+from imud.sampling.state import save_path, save_steady
 
 log = logging.getLogger(__name__)
 
@@ -118,12 +120,8 @@ class PathObserver:
         return records.encode_object(Kind.PATH, self._id, made)
 
     def _state(self, path: SamplePath) -> bytes:
-        external = {"ledger": self._ledger, "steady": self._host.steady, "observer": self}
-        path.clock.settle()
-        if path.attitude is not None:
-            path.attitude.save()
         try:
-            return StateWriter(external, path.NOT_STATE).write(path.roots)
+            return save_path(path)
         except StateError as error:
             log.warning("%s: recorded without its state: %s", self._config.name, error)
             return b""  # a replay then starts with a new clock
@@ -168,8 +166,7 @@ class ClockObserver:
         """Send the present state of the clocks to `put`, then each reading."""
         host = self._host
         host.utc_offset_ns()  # reads the clocks, so that the state is up to date
-        steady = StateWriter({}).write({"steady": host.steady})
-        call = CallRecord("host", "restore", [steady, *host.kept()])
+        call = CallRecord(*HostState.CALL, [save_steady(host.steady), *host.kept()])
         put(records.encode_object(Kind.CALL, records.NO_DEVICE, call))
         if put not in self.listeners:
             self.listeners.append(put)

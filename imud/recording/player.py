@@ -2,13 +2,17 @@
 
 The replay makes the samples, time stamps, errors and ledger counters of the live run again. Check records contain these
 values of the live run. The player compares them with its own values and counts the differences.
+
+A recording is a foreign file: it supplies values only. The name of its driver selects a row of imud's registry. Codec,
+clock and path come from their constructors. `imud.sampling.state` checks each value of a recorded state, and
+`imud.recording.calls` each recorded call.
 """
 
 import logging
 from bisect import bisect_right
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 from msgspec.structs import replace
@@ -19,21 +23,23 @@ from imud.attitude.published import FrameOptions, PublishedAxes, published_frame
 from imud.config.model import DeviceConfig
 from imud.contracts.codec import BadFrame, Reading
 from imud.contracts.driver import CanDriver, Driver, PolledDriver, StreamDriver
-from imud.contracts.lines import DeviceLines, Edge, TriggerStamp, UtcReference
+from imud.contracts.lines import DeviceLines, Edge
 from imud.contracts.publisher import Batch
 from imud.contracts.script import Message
 from imud.drivers import DRIVERS
 from imud.formats import records
 from imud.formats.records import CallRecord, CheckRecord, DeviceRecord, Kind, PathRecord, Record, SessionRecord
+from imud.formats.state import StateError
 from imud.host.clock import HostClock
 from imud.host.log import printable
 from imud.model.errors import ImudError, TransferError, reason_of
 from imud.model.event import Event, kind_of
-from imud.model.ledger import LEDGER_FIELDS, Ledger
+from imud.model.ledger import Ledger
 from imud.model.options import NoOptions
+from imud.model.sample import Sample
 from imud.model.units import NS_PER_MS
+from imud.recording.calls import HostState, repeat_call, set_ledger
 from imud.recording.observer import TROUBLES
-from imud.recording.state import StateError, StateReader
 from imud.sampling.driver_clock import make_clock
 from imud.sampling.path import (
     CanPath,
@@ -44,11 +50,17 @@ from imud.sampling.path import (
     SamplePath,
     StreamPath,
 )
+from imud.sampling.state import load_path, load_steady
 
 log = logging.getLogger(__name__)
 
 # Ledger counters that do not depend on codec and clock. The player copies them from each check record.
 FROM_OUTSIDE: Final = ("lost_queue", "replies_late", "replies_unsolicited")
+# Maximum number of devices in all runs of a recording, because each device needs memory: 64 devices in 16 runs
+DEVICES_MAX: Final = 1024
+# Maximum number of runs and suspends in a recording: a year with 170 a day
+OFFSETS_MAX: Final = 1 << 16
+NOTES_MAX: Final = 16  # maximum number of stored differences and reasons of a device; further ones only count
 _DATA: Final = int(Kind.DATA)  # integer of `Kind.DATA`: reading a member of an enumeration takes 0.1 µs on Python 3.11
 
 
@@ -67,10 +79,34 @@ class PlayedDevice:
     overruns: int = 0
     before: dict[str, int] | None = None  # counters of the live run at the start of the recording; None if unknown
     checks: int = 0  # number of check records
-    # Differences between replay and live run, one sentence for each check record that differs.
+    different_checks: int = 0  # number of check records whose values differ from the replay
+    # Differences between replay and live run, one sentence for each of the first check records that differ.
     differences: list[str] = field(default_factory=list)
-    # Reasons for each new clock that replaced the clock of the live run.
+    # Reasons for the first new clocks that replaced the clock of the live run.
     fresh_starts: list[str] = field(default_factory=list)
+    newest: Sample | None = None  # newest sample, after `end`
+    rate_hz: float = 0.0  # sample rate by the device counter, after `end`; 0 if unknown
+    unknown: Mapping[int, int] = field(default_factory=dict)  # frames of unknown types, after `end`
+
+    def end(self) -> None:
+        """Keep the results of the path. Release the path, which needs the most memory."""
+        path = self.path
+        if path is not None:
+            self.newest = path.newest
+            self.rate_hz = path.clock.expected_rate_hz
+            self.unknown = dict(path.unknown)
+            self.path = None
+
+    def note_fresh_start(self, reason: str) -> None:
+        """Note a new clock in place of the clock of the live run."""
+        if len(self.fresh_starts) < NOTES_MAX:
+            self.fresh_starts.append(reason)
+
+    def note_difference(self, difference: str) -> None:
+        """Note a check record that differs."""
+        self.different_checks += 1
+        if len(self.differences) < NOTES_MAX:
+            self.differences.append(difference)
 
     def note_frame(self, frame: BadFrame) -> None:
         """Note a CAN frame of a wrong length. The codec counts damaged frames in the ledger."""
@@ -81,7 +117,7 @@ class PlayedDevice:
 class RecordedEvent(msgspec.Struct, frozen=True):
     """An event of a recording. `kind` may be unknown to this version of imud."""
 
-    t_ns: int
+    t_ns: records.Time
     device: records.DeviceNameOrEmpty
     kind: str
     message: str
@@ -123,6 +159,7 @@ class RecordedClock:
 
     def __init__(self) -> None:
         self._runs: dict[int, _Offsets] = {}
+        self._offsets = 0  # number of runs and offsets
         self.begin(0)
 
     def read(self, record: Record) -> None:
@@ -134,13 +171,20 @@ class RecordedClock:
             self.begin(records.decode_object(record, SessionRecord).epoch)
         elif record.kind == Kind.CALL and record.device == records.NO_DEVICE:
             call = records.decode_object(record, CallRecord)
-            match (call.target, call.method, *call.arguments):
-                case ("host", "restore", _, int(offset_ns), int(suspends)):
-                    self.add(0, offset_ns, suspends)
+            if (call.target, call.method) == HostState.CALL:
+                state = HostState.of(call)
+                self.add(0, state.utc_offset_ns, state.suspends)
 
     def begin(self, epoch: int) -> None:
-        """Continue with the records of a run of imud."""
+        """Continue with the records of a run of imud. Raises ImudError above OFFSETS_MAX runs and suspends."""
+        if epoch not in self._runs:
+            self._count()
         self._run = self._runs.setdefault(epoch, _Offsets())
+
+    def _count(self) -> None:
+        self._offsets += 1
+        if self._offsets > OFFSETS_MAX:
+            raise ImudError(f"cannot read the recording: expected at most {OFFSETS_MAX} runs and suspends, got more")
 
     def add(self, monotonic_ns: int, offset_ns: int, suspends: int) -> None:
         """Add a reading of the clocks, in the order of the file."""
@@ -148,6 +192,7 @@ class RecordedClock:
         if run.offsets_ns and suspends == run.suspends:
             run.offsets_ns[-1] = offset_ns
             return
+        self._count()
         run.suspends = suspends
         run.starts_ns.append(monotonic_ns)
         run.offsets_ns.append(offset_ns)
@@ -187,7 +232,8 @@ class Player:
         state.
         """
         self.devices: dict[int, PlayedDevice] = {}  # devices by their number in the recorded daemon
-        self.earlier: list[PlayedDevice] = []  # devices of the earlier runs of imud in joined files
+        # devices of the earlier runs of imud in joined files, without their paths
+        self.earlier: list[PlayedDevice] = []
         self.lost = 0  # number of records that the recorder dropped
         self._publish = publish
         self._on_event = on_event
@@ -196,6 +242,7 @@ class Player:
         self._epoch: int | None = None  # run of the newest file; None before the first
         # reason to ignore recorded states; empty if the player uses them
         self._no_state = "a new clock was requested" if fresh else ""
+        self._no_host_state = ""  # reason to ignore the states of devices: the state of the host clocks is not usable
 
     def play(self, found: Iterable[Record]) -> None:
         """Process records. Raises ImudError for an invalid record, and OSError if `publish` raises it."""
@@ -204,7 +251,7 @@ class Player:
                 self._play(record)
             except (ImudError, OSError):  # codecs and clocks do no I/O: `publish` raised the OSError
                 raise
-            except Exception as error:  # a forged state can cause any exception in a codec or clock
+            except Exception as error:  # forged values can cause any exception in a codec or clock
                 words = f"{type(error).__name__}: {printable(str(error))}"
                 raise ImudError(
                     f"cannot replay a record of kind {record.kind}: {words}; is the file damaged?"
@@ -251,11 +298,14 @@ class Player:
     def _begin(self, session: SessionRecord) -> None:
         self._on_session(session.epoch)
         if session.epoch != self._epoch:  # another run numbers its devices and samples from the start
+            for device in self.devices.values():
+                device.end()
             self.earlier += self.devices.values()
             self.devices.clear()
             self._epoch = session.epoch
         if session.imud != __version__:
-            self._no_state = self._no_state or f"imud {session.imud} wrote the recording, this is imud {__version__}"
+            recorder = printable(session.imud)
+            self._no_state = self._no_state or f"imud {recorder} wrote the recording, this is imud {__version__}"
 
     def _event(self, recorded: RecordedEvent) -> None:
         event = Event(recorded.t_ns, recorded.device, kind_of(recorded.kind), recorded.message, recorded.detail)
@@ -274,9 +324,19 @@ class Player:
                 if device.path is not None and device.path.fresh:
                     device.ledger.add_unknown_gap()
 
-    def _restore_host(self, steady: bytes, offset_ns: int, suspends: int) -> None:
-        StateReader(steady, {}).restore("steady", self._host.steady)
-        self._host.offset_ns, self._host.suspends = offset_ns, suspends
+    def _restore_host(self, state: HostState) -> None:
+        """Continue from the clocks of a host. If their state is not usable, all clocks of devices start again."""
+        host = self._host
+        host.offset_ns, host.suspends = state.utc_offset_ns, state.suspends
+        host.steady.restart()
+        self._no_host_state = ""
+        if self._no_state:
+            return
+        try:
+            load_steady(host.steady, state.steady)
+        except StateError as error:
+            host.steady.restart()
+            self._no_host_state = f"cannot restore the clocks of the host: {error}"
 
     # --- devices -----------------------------------------------------------------------------------------------------
 
@@ -288,6 +348,8 @@ class Player:
     def _describe(self, device_id: int, described: DeviceRecord) -> None:
         known = self.devices.get(device_id)
         if known is None:
+            if len(self.devices) + len(self.earlier) >= DEVICES_MAX:
+                raise ImudError(f"cannot replay the recording: expected at most {DEVICES_MAX} devices in all runs")
             self.devices[device_id] = PlayedDevice(device_id, described)
         else:
             known.described = described
@@ -303,13 +365,13 @@ class Player:
         config = device.config = _config_of(device.described, driver, made)
         before = device.path
         device.path = self._path(device, driver, config, made, before=None)
-        _set_ledger(device.ledger, made.ledger)
+        set_ledger(device.ledger, made.ledger)
         if device.before is None:
             device.before = device.ledger.snapshot()
         try:
             self._restore(device, made.state)
         except StateError as error:
-            device.fresh_starts.append(str(error))
+            device.note_fresh_start(str(error))
             # the new clock continues the sequence numbers of the previous path
             device.path = self._path(device, driver, config, made, before=before)
             ledger = device.ledger
@@ -318,18 +380,15 @@ class Player:
             ledger.frames_ignored, ledger.frames_pending = ledger.frames_ignored + ledger.frames_pending, 0
 
     def _restore(self, device: PlayedDevice, state: bytes) -> None:
-        if self._no_state or not state:
-            raise StateError(self._no_state or "the recording does not contain the state of the clock")
+        if reason := self._no_state or self._no_host_state:
+            raise StateError(reason)
+        if not state:
+            raise StateError("the recording does not contain the state of the clock")
         assert device.path is not None
-        external = {"ledger": device.ledger, "steady": self._host.steady, "observer": None}
-        reader = StateReader(state, external)
-        for name, root in device.path.roots.items():
-            reader.restore(name, root)
-        if device.path.attitude is not None:
-            try:
-                device.path.attitude.resume()
-            except ValueError as error:
-                raise StateError(f"cannot restore the state: {error}") from None
+        try:
+            load_path(device.path, state)
+        except StateError as error:
+            raise StateError(f"cannot restore the state: {error}") from None
 
     def _path(
         self, device: PlayedDevice, driver: Driver, config: DeviceConfig, made: PathRecord, before: SamplePath | None
@@ -358,10 +417,11 @@ class Player:
     # --- calls -------------------------------------------------------------------------------------------------------
 
     def _call(self, device: PlayedDevice | None, call: CallRecord) -> None:
-        if call.target == "host" and call.method == "restore":
-            self._restore_host(*call.arguments)
+        if (call.target, call.method) == HostState.CALL:
+            self._restore_host(HostState.of(call))
         elif device is not None and device.path is not None:
-            _repeat(device, device.path, call)
+            overruns = repeat_call(device.path, device.ledger, call)
+            device.overruns = device.overruns if overruns is None else overruns
 
 
 def _frame_of(config: DeviceConfig, driver: Driver, described: DeviceRecord) -> PublishedAxes:
@@ -431,40 +491,7 @@ def _check(device: PlayedDevice, live: CheckRecord) -> None:
     }
     if found:
         words = ", ".join(f"{name} recorded {a}, replayed {b}" for name, (a, b) in found.items())
-        device.differences.append(f"at {live.t_ns} ns: {words}")
-
-
-def _set_ledger(ledger: Ledger, values: dict[str, int]) -> None:
-    for name in LEDGER_FIELDS:
-        setattr(ledger, name, values.get(name, 0))  # 0: an older imud did not have the counter
-
-
-def _repeat(device: PlayedDevice, path: Any, call: CallRecord) -> None:
-    """Repeat a recorded call of the path, its clock or its edges."""
-    arguments = call.arguments
-    match call.target, call.method:
-        case "path", "begin" | "flush" | "reset" | "publish_gathered" | "set_frame_time":
-            getattr(path, call.method)(*arguments)
-        case "path", "skip":
-            device.ledger.bytes_in += arguments[0]
-            device.ledger.bytes_skipped += arguments[0]
-        case "path", "overruns":
-            device.overruns = arguments[0]
-        case "ledger", "set":
-            _set_ledger(device.ledger, msgspec.convert(arguments[0], dict[str, int]))
-        case "loss", "link_opened":
-            path.link_opened()
-        case "edges", "restart":
-            path.edges.restart()
-        case "clock", "restart" | "link_changed" | "set_own_status" | "expect_rate":
-            getattr(path.clock, call.method)(*arguments, **call.keywords)
-        case "clock", "set_utc_reference":
-            path.clock.set_utc_reference(None if arguments[0] is None else UtcReference(*arguments[0]))
-        case "aiding", "on_trigger_stamps":
-            path.clock.add_triggers([TriggerStamp(*one) for one in arguments[0]])
-        case _:
-            name = f"{call.target}.{call.method}"
-            raise ImudError(f"cannot replay the call {name}: imud {__version__} does not know it; try a newer imud")
+        device.note_difference(f"at {live.t_ns} ns: {words}")
 
 
 def ignore_message(_message: Message, _t_rx_ns: int) -> None:

@@ -162,35 +162,17 @@ class HostAttitude:
 
     # --- recordings ---------------------------------------------------------------------------------------------------
 
+    def filter_state(self) -> dict[str, Any]:
+        """Return the state of the filter, by the names of vqf."""
+        state: dict[str, Any] = self._filter.state
+        return state
+
     def save(self) -> None:
         """Prepare the attributes for a recording."""
-        self.saved = self._filter.state
+        self.saved = self.filter_state()
 
     def resume(self) -> None:
-        """Continue from the attributes of a recording. Raises ValueError if they do not fit this version of vqf."""
-        period_ns = self._period_ns
-        if wrong := [name for name, kinds in _KINDS.items() if _shape(getattr(self, name)) not in kinds]:
-            raise ValueError(f"expected the attributes of an attitude filter, got another type of {wrong[0]}")
-        if not 0 < period_ns <= PERIOD_MAX_NS:
-            raise ValueError(f"expected a period of the attitude filter from 1 to {PERIOD_MAX_NS} ns, got {period_ns}")
-        restored = _vqf()(period_ns / NS_PER_S)
-        if _shape(self.saved) != _shape(restored.state):
-            raise ValueError("expected the state of an attitude filter of the installed vqf, got another state")
+        """Continue from the attributes of a recording, whose types and ranges are valid (`imud.sampling.state`)."""
+        restored = _vqf()(self._period_ns / NS_PER_S)
         restored.state = self.saved
         self._filter = restored
-
-
-# Shapes of the attributes in a recording, which is a foreign file
-_KINDS: Final[dict[str, tuple[Any, ...]]] = {
-    "_period_ns": (int,), "_started_ns": (int,), "_newest_ns": (int, type(None)), "_settled": (bool,),
-    "_bias": ((tuple, float, float, float),),
-    "_yaw_rad": (float,), "_turn": ((tuple, *4 * [float]), type(None)),
-    "_intervals_ns": tuple((list, *n * [int]) for n in range(BLOCK)),
-}  # fmt: skip
-
-
-def _shape(state: Any) -> Any:
-    """Return names, types and lengths of a state. The library does not check them."""
-    if isinstance(state, dict):
-        return {name: _shape(one) for name, one in state.items()}
-    return (type(state), *map(type, state)) if isinstance(state, list | tuple) else type(state)

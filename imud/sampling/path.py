@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from math import hypot, sqrt
-from typing import Any, ClassVar, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 from msgspec.structs import replace
 
@@ -74,14 +74,6 @@ class PathContext:
 class SamplePath(ABC):
     """Path from the data of one device to published samples. The subclasses receive the data."""
 
-    # Attributes that a recorded state does not contain: parts of the daemon, and statistics.
-    NOT_STATE: ClassVar = frozenset({
-        "_changes", "_device", "_device_id", "_drain_edges", "_ledger", "_listener", "_now_ns", "_on_bad_frame",
-        "_on_message", "_overruns", "_publish", "_start_run", "_status_mask", "_status_seen",
-        "_utc_offset_ns", "attitude", "frame", "latency",
-        "_array", "_filter", "_from_up", "_to_euler",  # of `attitude`
-    })  # fmt: skip
-
     # `HostAttitude`; None if imud does not compute it. In the class, because more than 30 attributes are slower.
     attitude: Any = None
 
@@ -123,11 +115,6 @@ class SamplePath(ABC):
             self.attitude.set_axes(frame.device)
         self.frame = frame
         self._changes = self.frame.rotation is not None or self.attitude is not None
-
-    @property
-    def roots(self) -> Mapping[str, object]:
-        """Objects with the state of the path, by name, without the attributes in NOT_STATE."""
-        return {"path": self} if self.attitude is None else {"path": self, "attitude": self.attitude}
 
     def observe(self, observer: InputObserver | None) -> None:
         """Report each input of the path and of its clock to `observer`. None stops the reports."""

@@ -93,7 +93,7 @@ def test_the_devices_own_time_and_a_live_view_that_drops_the_past() -> None:
 
 def test_notes_about_a_replay_and_the_progress(monkeypatch: pytest.MonkeyPatch) -> None:
     for differences, fresh, notes in ((0, [], []), (2, ["x", "y"], ["clock: x", "replay: 2 of 7 checks differ"])):
-        one = Mock(driver=None, fresh_starts=fresh, differences=["a"] * differences, checks=7)
+        one = Mock(driver=None, fresh_starts=fresh, different_checks=differences, checks=7)
         one.described.name = "bow"
         for name, found in (("stern", []), ("bow", notes)):
             made = SampleSet("a", name)

@@ -27,11 +27,11 @@ from imud.host.clock import HostClock
 from imud.model.ledger import Ledger
 from imud.model.sample import Sync
 from imud.model.units import NS_PER_MS, NS_PER_US
-from imud.recording.state import StateWriter
 from imud.sampling.clock import SampleClock
 from imud.sampling.driver_clock import make_clock
 from imud.sampling.path import PathContext, StreamPath
 from imud.sampling.stamp_time import StampTime
+from imud.sampling.state import save_path
 from tests.support.event_loops import UTC_AHEAD_NS
 from tests.support.files import hi91
 
@@ -207,10 +207,8 @@ class Run:
     def result(self) -> tuple[Any, ...]:
         path = self.path
         path.publish_gathered()
-        external = {"ledger": self.ledger, "steady": self.steady, "observer": self.seen.observer}
         newest, taken = (path.quality, path.clock.t_ns, path.clock.t_rx_ns(), path.newest), path.take_status()
-        path.clock.settle()
-        state = StateWriter(external, path.NOT_STATE).write({"path": path})
+        state = save_path(path)
         return (
             self.slots, self.ledger.snapshot(), path.latency.buckets, path.latency.sum_ns, newest, taken,
             self.seen.mock_calls, path.clock.status(), state, self.held,

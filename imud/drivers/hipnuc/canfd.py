@@ -24,7 +24,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import replace
 from random import Random
-from typing import Final
+from typing import Any, ClassVar, Final
 
 import msgspec
 
@@ -32,6 +32,7 @@ from imud.attitude.rotation import euler312_from_quat
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, wrong_length
 from imud.contracts.driver import random_vector
 from imud.drivers.hipnuc.assembly import COPY_NS, KindLosses
+from imud.drivers.hipnuc.assembly_state import KIND_LOSSES, SAME_ADDRESS
 from imud.drivers.hipnuc.common import (
     ACCEL_M_S2_PER_LSB,
     EULER_RAD_PER_LSB,
@@ -46,13 +47,24 @@ from imud.drivers.hipnuc.common import (
     vector_of,
 )
 from imud.drivers.hipnuc.j1939 import commands
-from imud.drivers.hipnuc.j1939.codec import CONFIGURE, FAST, FAST_OLD, HOST_ADDRESS, NodeCodec, NodeOptions, encode
+from imud.drivers.hipnuc.j1939.codec import (
+    CONFIGURE,
+    FAST,
+    FAST_OLD,
+    HOST_ADDRESS,
+    NODE_OTHER,
+    NodeCodec,
+    NodeOptions,
+    encode,
+)
 from imud.drivers.hipnuc.j1939.driver import DRIVER as J1939
 from imud.drivers.hipnuc.same_address import SameAddress
 from imud.drivers.hipnuc.uart import ins
+from imud.drivers.state import TIME, UNKNOWN
 from imud.drivers.value_limits import possible_angles, possible_quaternion, possible_temperature_c
 from imud.formats.can import FD_DATA_BYTES_MAX, FD_LENGTHS, CanFilter, CanFrame
 from imud.formats.j1939 import ADDRESS_MAX, filter_of, split
+from imud.formats.state import Data, Field, Map, New, OneOf, Row, StateError, StateTable
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from imud.model.units import NS_PER_MS
@@ -74,8 +86,27 @@ def padded(size: int) -> int:
     return next((length for length in FD_LENGTHS if length >= size), 0)
 
 
+_PGN: Final = OneOf(*PGNS)
+
+
+def _check_losses(codec: Any) -> None:
+    if codec._losses.keys() != set(PGNS):
+        raise StateError("expected the losses of each PGN")
+
+
 class HipnucCanfdCodec(NodeCodec):
     """Decoder of the frames of one device."""
+
+    STATE: ClassVar = StateTable(
+        (
+            Field(1, "unknown", UNKNOWN),
+            Field(2, "_same_address", SAME_ADDRESS),
+            Field(3, "_newest", Map(_PGN, Row(Data(FD_DATA_BYTES_MAX), TIME), len(PGNS))),
+            Field(4, "_losses", Map(_PGN, New(KIND_LOSSES, lambda _codec: KindLosses()), len(PGNS))),
+        ),
+        NODE_OTHER,
+        _check_losses,
+    )
 
     def __init__(self, ledger: Ledger, settings: HipnucCanfdOptions) -> None:
         super().__init__(ledger, settings, PGNS)

@@ -16,7 +16,7 @@ received reference and keeps it. imud ignores the other heading. It does not app
 from collections.abc import Mapping, Sequence
 from math import isfinite, nan, pi, tau
 from random import Random
-from typing import Annotated, Any, Final, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple
 
 from msgspec import Meta
 
@@ -26,7 +26,9 @@ from imud.contracts.codec import CodecEvent, count_unknown, wrong_length
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, Identity
 from imud.contracts.script import says_nothing
 from imud.drivers.hipnuc.assembly import Assembled, Assembly
+from imud.drivers.hipnuc.assembly_state import ASSEMBLY, check_parts
 from imud.drivers.hipnuc.common import FLOATS, random_quaternion
+from imud.drivers.state import DAEMON, FLAG, OPTIONS, TIME, UNKNOWN
 from imud.formats import nmea2000
 from imud.formats.can import CanFilter, CanFrame
 from imud.formats.j1939 import (
@@ -57,6 +59,7 @@ from imud.formats.nmea2000 import (
     SID_MOST,
     Reference,
 )
+from imud.formats.state import Field, Integer, Map, Maybe, StateTable, member_of
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Vector3
@@ -163,10 +166,26 @@ class HipnucNmea2000Options(Options, frozen=True, kw_only=True, forbid_unknown_f
     """Heading to use if the sender sends two; `auto` = the first received reference."""
 
 
+_SIZES: Final = dict.fromkeys(PGNS, MESSAGE_BYTES)  # length of the messages of a sample, bytes
+
+
 class HipnucNmea2000Codec:
     """Decoder of the frames of one sender. Synchronization: one thread."""
 
     counts_losses = True
+    STATE: ClassVar = StateTable(
+        (
+            Field(1, "_source", Maybe(Integer(0, ADDRESS_MAX))),
+            Field(2, "_assembly", ASSEMBLY),
+            Field(3, "_reference", Maybe(member_of(Reference))),
+            Field(4, "_has_heading", FLAG),
+            Field(5, "_heard_ns", TIME),
+            Field(6, "_frames", Map(Integer(0, ADDRESS_MAX), Integer(0, 2), ADDRESS_MAX + 1)),
+            Field(7, "unknown", UNKNOWN),
+        ),
+        {"ledger": DAEMON, "_fixed": OPTIONS, "_wanted_reference": OPTIONS},
+        lambda codec: check_parts(codec._assembly, _SIZES),
+    )
 
     def __init__(self, ledger: Ledger, settings: HipnucNmea2000Options) -> None:
         self.ledger = ledger

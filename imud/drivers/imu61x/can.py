@@ -30,7 +30,7 @@ number of lost samples. The device accepts no commands over CAN.
 import struct
 from collections.abc import Sequence
 from random import Random
-from typing import Annotated, Final
+from typing import Annotated, ClassVar, Final
 
 from msgspec import Meta
 
@@ -47,6 +47,7 @@ from imud.drivers.imu61x.common import (
     SHEET,
     relative_heading,
 )
+from imud.drivers.state import COUNT, DAEMON, OPTIONS, TIME, UNKNOWN
 from imud.drivers.value_limits import (
     ACCEL_LIMIT_G,
     GYRO_LIMIT_DEG_S,
@@ -56,6 +57,7 @@ from imud.drivers.value_limits import (
     scaled,
 )
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, CanFrame
+from imud.formats.state import Data, Field, Integer, Items, Map, Maybe, StateTable
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Vector3
@@ -91,10 +93,21 @@ class Imu61xCanOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields
     """Identifier of the first of the five frames, decimal; the other identifiers follow."""
 
 
+_INDEX: Final = Integer(0, INDEX_MODULUS - 1)
+
+
 class _Pace:
     """Duration of a set on the bus, and of a sample, learned from sets that are certainly complete."""
 
     __slots__ = ("_period_ns", "_sets", "_span_ns", "longest_ns")
+    STATE: ClassVar = StateTable(
+        (
+            Field(1, "_period_ns", TIME),
+            Field(2, "_sets", COUNT),
+            Field(3, "_span_ns", TIME),
+            Field(4, "longest_ns", Integer(0, _NEVER_NS)),
+        )
+    )
 
     def __init__(self) -> None:
         self.longest_ns = _NEVER_NS  # maximum duration of a set of one sample, ns
@@ -124,6 +137,13 @@ class _Series:
     """Series of INDEX. Each device continues a series of its own. Synchronization: one thread."""
 
     __slots__ = ("_alternations", "_newest", "_steady")
+    STATE: ClassVar = StateTable(
+        (
+            Field(1, "_newest", Items(_INDEX, SERIES_MAX)),
+            Field(2, "_steady", COUNT),
+            Field(3, "_alternations", COUNT),
+        )
+    )
 
     def __init__(self) -> None:
         self._newest: list[int] = []  # newest INDEX of each series, the series with the newest frame last
@@ -161,6 +181,20 @@ class Imu61xCanCodec:
     """Decoder of the frames of one device. Synchronization: one thread."""
 
     counts_losses = False
+    STATE: ClassVar = StateTable(
+        (
+            Field(1, "unknown", UNKNOWN),
+            Field(2, "_held", Map(Integer(0, _CLOSING - 1), Data(FRAME_BYTES, FRAME_BYTES), _CLOSING)),
+            Field(3, "_newest", Integer(-1, _CLOSING - 1)),
+            Field(4, "_first_ns", TIME),
+            Field(5, "_index", Maybe(_INDEX)),
+            Field(6, "_closed_ns", TIME),
+            Field(7, "_pace", _Pace.STATE),
+            Field(8, "_closing", Data(FRAME_BYTES)),
+            Field(9, "_series", _Series.STATE),
+        ),
+        {"ledger": DAEMON, "_slots": OPTIONS},
+    )
 
     def __init__(self, ledger: Ledger, settings: Imu61xCanOptions) -> None:
         self.ledger = ledger

@@ -10,7 +10,7 @@ periodically.
 import struct
 from collections.abc import Collection, Sequence
 from random import Random
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 from imud.contracts.codec import BadReason, Poll, PolledEvent, Vanished
 from imud.contracts.command import Target
@@ -41,7 +41,9 @@ from imud.drivers.imu61x.registers import (
     wanted_filter,
 )
 from imud.drivers.polled_frames import Measured, PolledFrameDecoder
+from imud.drivers.state import DAEMON, OPTIONS
 from imud.drivers.value_limits import ACCEL_LIMIT_G, GYRO_LIMIT_DEG_S, possible_temperature_c, scaled
+from imud.formats.state import Field, StateTable
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement, Vector3
 from imud.model.units import NS_PER_S
@@ -107,6 +109,9 @@ class Imu61xI2cCodec:
     """Decoder of bursts. Synchronization: one thread."""
 
     polls: Sequence[Poll] = (Poll(READ_BURST), Poll(READ_ID, CHECK_NS), Poll(READ_FILTER, CHECK_NS))
+    STATE: ClassVar = StateTable(
+        (Field(1, "_frames", PolledFrameDecoder.STATE),), {"ledger": DAEMON, "_settings": OPTIONS}
+    )
 
     def __init__(self, ledger: Ledger, settings: RegisterOptions) -> None:
         self.ledger = ledger

@@ -5,7 +5,7 @@
 import struct
 from collections.abc import Collection, Sequence
 from random import Random
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal
 
 from msgspec import Meta
 
@@ -40,7 +40,9 @@ from imud.drivers.imu61x.registers import (
     wanted_filter,
 )
 from imud.drivers.polled_frames import Measured, PolledFrameDecoder, absence
+from imud.drivers.state import DAEMON, NUMBER, OPTIONS
 from imud.drivers.value_limits import ACCEL_LIMIT_G, GYRO_LIMIT_DEG_S, TURN_DEG, possible_temperature_c, scaled
+from imud.formats.state import Field, Maybe, StateTable
 from imud.model.errors import DeviceRefused, TransferError
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement, Vector3
@@ -291,6 +293,14 @@ class Imu61xSpiCodec:
     no check value: the codec rejects only impossible bytes, and a value may consist of two updates (an error of at most
     one step of its high word).
     """
+
+    STATE: ClassVar = StateTable(
+        (
+            Field(1, "_frames", PolledFrameDecoder.STATE),
+            Field(2, "_temperature_c", Maybe(NUMBER)),
+        ),
+        {"ledger": DAEMON, "polls": OPTIONS, "_settings": OPTIONS, "_bad": OPTIONS, "_measure": OPTIONS},
+    )
 
     def __init__(self, ledger: Ledger, settings: SpiDeviceOptions) -> None:
         self.ledger = ledger

@@ -20,7 +20,7 @@ reply frame if the state changed or is not operational. Emergencies (0x080 + nod
 
 import struct
 from collections.abc import Sequence
-from typing import Annotated, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal
 
 from msgspec import Meta
 
@@ -28,6 +28,7 @@ from imud.attitude.rotation import quat_from_euler312
 from imud.contracts.codec import CodecEvent, count_unknown, wrong_length
 from imud.contracts.script import ReplyFrame
 from imud.drivers.hipnuc.assembly import Assembled, Assembly
+from imud.drivers.hipnuc.assembly_state import ASSEMBLY, check_parts
 from imud.drivers.hipnuc.canopen.cia301 import (
     EMERGENCY,
     HEARTBEAT,
@@ -43,7 +44,9 @@ from imud.drivers.hipnuc.canopen.cia301 import (
     TpdoNumber,
 )
 from imud.drivers.hipnuc.common import M_S2_PER_G, QUAT_PER_LSB, pressure_of, vector_of
+from imud.drivers.state import DAEMON, OPTIONS, UNKNOWN
 from imud.drivers.value_limits import possible_angles, possible_quaternion
+from imud.formats.state import Field, Integer, StateTable
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Pair, Quaternion, Vector3
@@ -82,10 +85,25 @@ class HipnucCanopenOptions(Options, frozen=True, kw_only=True, forbid_unknown_fi
             raise ValueError(f"sync_hz: expected 0, or {SYNC_HZ_MIN} to {SYNC_HZ_MAX:g}, got {self.sync_hz}")
 
 
+_SIZES: Final = {number: layout.size for number, layout in LAYOUTS.items()}  # length of each TPDO, bytes
+
+
 class HipnucCanopenCodec:
     """Decoder of the TPDOs of one node. Synchronization: one thread."""
 
     counts_losses = True
+    STATE: ClassVar = StateTable(
+        (
+            Field(1, "_assembly", ASSEMBLY),
+            Field(2, "_state", Integer(0, 0xFF)),
+            Field(3, "unknown", UNKNOWN),
+        ),
+        {
+            "ledger": DAEMON, "_tpdos": OPTIONS, "_sdo_id": OPTIONS, "_heartbeat_id": OPTIONS,
+            "_emergency_id": OPTIONS, "_node": OPTIONS,
+        },
+        lambda codec: check_parts(codec._assembly, _SIZES),
+    )  # fmt: skip
 
     def __init__(self, ledger: Ledger, settings: HipnucCanopenOptions) -> None:
         self.ledger = ledger

@@ -18,7 +18,7 @@ import struct
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from math import hypot, isfinite, nan
-from typing import Annotated, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal
 
 import msgspec
 from msgspec import Meta
@@ -27,6 +27,7 @@ from imud.attitude.rotation import quat_from_euler312
 from imud.contracts.codec import CodecEvent, count_unknown, wrong_length
 from imud.contracts.script import ReplyFrame
 from imud.drivers.hipnuc.assembly import Assembled, Assembly
+from imud.drivers.hipnuc.assembly_state import ASSEMBLY, check_parts
 from imud.drivers.hipnuc.common import (
     ACCEL_M_S2_PER_LSB,
     EULER_RAD_PER_LSB,
@@ -45,8 +46,10 @@ from imud.drivers.hipnuc.uart.ins import (
     utc_fields,
     utc_ns_of,
 )
+from imud.drivers.state import DAEMON, OPTIONS, TIME, UNKNOWN
 from imud.drivers.value_limits import HEIGHT_LIMIT_M, possible_quaternion, possible_temperature_c
 from imud.formats.j1939 import ADDRESS_MAX, WITHOUT_PRIORITY, J1939Id, join, split
+from imud.formats.state import Field, Integer, Maybe, Row, StateTable
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Position, Quaternion, Vector3
@@ -403,8 +406,23 @@ class NodeCodec:
         raise NotImplementedError
 
 
+_SIZES: Final = dict.fromkeys(MEASURED, MESSAGE_BYTES)  # length of the messages of a sample, bytes
+# Attributes of a `NodeCodec` that are not state
+NODE_OTHER: Final = {"ledger": DAEMON, "_pgns": OPTIONS, "_reply_ids": OPTIONS, "_address": OPTIONS}
+
+
 class HipnucJ1939Codec(NodeCodec):
     """Decoder of the classical CAN messages of one device."""
+
+    STATE: ClassVar = StateTable(
+        (
+            Field(1, "_assembly", ASSEMBLY),
+            Field(2, "_utc", Maybe(Row(Integer(0, (1 << 63) - 1), TIME))),
+            Field(3, "unknown", UNKNOWN),
+        ),
+        NODE_OTHER,
+        lambda codec: check_parts(codec._assembly, _SIZES),
+    )
 
     def __init__(self, ledger: Ledger, settings: HipnucJ1939Options) -> None:
         super().__init__(ledger, settings, (UTC, *settings.measured()))

@@ -25,7 +25,7 @@ that the product lacks the sensor. `pressure_of` decides which pressures are val
 import struct
 from collections.abc import Sequence
 from math import atan2, cos, radians, sin
-from typing import Annotated, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal
 
 from msgspec import Meta
 
@@ -60,6 +60,7 @@ from imud.drivers.hipnuc.modbus.registers import (
     read_registers,
 )
 from imud.drivers.polled_frames import Measured, PolledFrameDecoder, absence
+from imud.drivers.state import COUNT, DAEMON, FLAG, NUMBER, OPTIONS
 from imud.drivers.value_limits import possible_angles, possible_quaternion, possible_temperature_c
 from imud.formats.modbus import (
     CRC_BYTES,
@@ -70,6 +71,7 @@ from imud.formats.modbus import (
     is_exception,
     is_whole,
 )
+from imud.formats.state import Data, Field, Integer, Maybe, New, OneOf, StateTable
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Pair, Quaternion, Vector3
@@ -96,6 +98,7 @@ READ_STATUS: Final = read_registers(BY_NAME["MAIN_STATUS"].address, BY_NAME["MAI
 # Time between two reads of MAIN_STATUS, which is not in the block: maximum age of `status` of a sample, ns
 STATUS_NS: Final = NS_PER_S
 RESERVED_STATUS: Final = 1 << 13  # lowest reserved bit of MAIN_STATUS: with it, the register has filler bytes
+SERIAL_BYTES_MAX: Final = 64  # maximum length of the serial number in a recorded state, bytes
 _SAMPLE, _SERIAL, _STATUS, _HEAVE = 0, 1, 2, 3
 _SHORT, _USUAL, _LONG = READ_SHORT_BLOCK, READ_BLOCK, READ_LONG_BLOCK
 
@@ -120,6 +123,24 @@ class HipnucModbusCodec:
 
     `reset` keeps the known set of registers. It forgets scales and serial number.
     """
+
+    STATE: ClassVar = StateTable(
+        (
+            Field(1, "_block", OneOf(_SHORT, _USUAL, _LONG)),
+            Field(2, "_sure", FLAG),
+            Field(3, "_just_shortened", FLAG),
+            Field(4, "_answered", FLAG),
+            Field(5, "_silent", COUNT),
+            Field(6, "_stale_before", COUNT),
+            Field(7, "_book", New(PolledFrameDecoder.STATE, lambda codec: codec.new_book())),
+            Field(8, "_quat_scale", NUMBER),
+            Field(9, "_incli_scale", NUMBER),
+            Field(10, "_serial", Data(SERIAL_BYTES_MAX)),
+            Field(11, "_status", Maybe(Integer(0, RESERVED_STATUS - 1))),
+        ),
+        {"ledger": DAEMON, "_fixed_incli": OPTIONS, "polls": "computed from `_block`"},
+        lambda codec: codec.use_block(),
+    )
 
     def __init__(self, ledger: Ledger, settings: HipnucModbusOptions) -> None:
         self.ledger = ledger
@@ -190,9 +211,17 @@ class HipnucModbusCodec:
         self._block, self._sure = block, sure
         self._just_shortened = self._answered = False
         self._silent = 0
-        self.polls: Sequence[Poll] = _polls(block)
+        self.use_block()
         self._stale_before = self.stale
-        self._book = PolledFrameDecoder(self.ledger, block.read_bytes)
+        self._book = self.new_book()
+
+    def use_block(self) -> None:
+        """Compute the polls of the present block."""
+        self.polls: Sequence[Poll] = _polls(self._block)
+
+    def new_book(self) -> PolledFrameDecoder:
+        """Return a decoder of the present block."""
+        return PolledFrameDecoder(self.ledger, self._block.read_bytes)
 
     def _decode_serial(self, data: bytes) -> Sequence[PolledEvent]:
         whole = len(data) == READ_SERIAL.read_bytes and is_whole(data) and not absence(data)

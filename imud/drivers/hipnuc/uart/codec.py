@@ -24,7 +24,7 @@ from binascii import crc_hqx as crc16_xmodem
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import isfinite
-from typing import Final, Literal, ParamSpec
+from typing import ClassVar, Final, Literal, ParamSpec
 
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, count_unknown
 from imud.contracts.lines import TimeBits
@@ -42,6 +42,7 @@ from imud.drivers.hipnuc.common import (
 )
 from imud.drivers.hipnuc.uart.ins import HI81, TAG_HI81, TAG_HI83, decode_hi81, decode_hi83, hi83_bytes
 from imud.drivers.hipnuc.uart.replies import LINE_CHARACTERS_MAX, SENTENCE_TYPE_MIN, LineFinder, sentence_name
+from imud.drivers.state import DAEMON, FLAG, OPTIONS, UNKNOWN
 from imud.drivers.value_limits import (
     ACCEL_LIMIT_G,
     GYRO_LIMIT_DEG_S,
@@ -54,6 +55,7 @@ from imud.drivers.value_limits import (
     scaled,
 )
 from imud.formats.kernel import KernelFormat, KernelFrames
+from imud.formats.state import Data, Field, Integer, OneOf, StateTable
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Quaternion, Vector3
@@ -176,9 +178,10 @@ def _format(name: str, size: int) -> KernelFormat:
 
 
 HI91_FORMAT: Final = _format("HI91", HI91.size)
+HI92_FORMAT: Final = _format("HI92", HI92.size)
 PACKETS: Final = {
     TAG_HI91: Packet(HI91_FORMAT, HI91.size, _decode_hi91),
-    TAG_HI92: Packet(_format("HI92", HI92.size), HI92.size, _decode_hi92),
+    TAG_HI92: Packet(HI92_FORMAT, HI92.size, _decode_hi92),
     TAG_HI81: Packet(None, HI81.size, decode_hi81),
     TAG_HI83: Packet(None, 0, decode_hi83),
 }
@@ -287,6 +290,19 @@ class HipnucCodec(KernelFrames):
     with NaN or infinity, the codec returns a `BadFrame` (not-finite) and the measurement without these values; the
     frame counts as good.
     """
+
+    STATE: ClassVar = StateTable(
+        (
+            Field(1, "_tail", Data(FRAME_BYTES_MAX)),
+            Field(2, "unknown", UNKNOWN),
+            Field(3, "word_is_status", FLAG),
+            Field(4, "kernel_format", OneOf(HI91_FORMAT, HI92_FORMAT)),
+            Field(5, "_lines", LineFinder.STATE),
+            Field(6, "_bad_ahead", Integer(0, FRAME_BYTES_MAX)),
+            Field(7, "_barred_ahead", Integer(0, FRAME_BYTES_MAX)),
+        ),
+        {"ledger": DAEMON, "_word_is_fixed": OPTIONS},
+    )
 
     def __init__(self, ledger: Ledger, settings: HipnucOptions) -> None:
         super().__init__(ledger)

@@ -15,11 +15,13 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
-from typing import Final, NamedTuple
+from typing import ClassVar, Final, NamedTuple
 
 from imud.contracts.codec import BadFrame, BadReason, count_unknown
 from imud.contracts.script import Message, TextLine
+from imud.drivers.state import DAEMON, FLAG
 from imud.formats.nmea0183 import checksum
+from imud.formats.state import Data, Field, Integer, StateTable
 from imud.model.ledger import Ledger
 
 _VERSION_LINE: Final = re.compile(r"\s*(?:PNAME|BUILD|UUID|APP_VER|BL_VER)\s*[=:].*")
@@ -164,6 +166,16 @@ class LineFinder:
     is wrong.
     Synchronization: one thread. Holds at most LINE_CHARACTERS_MAX + 1 bytes.
     """
+
+    STATE: ClassVar = StateTable(
+        (
+            Field(1, "_held", Data(LINE_CHARACTERS_MAX + 1)),
+            Field(2, "_held_bad", Integer(0, LINE_CHARACTERS_MAX + 1)),
+            Field(3, "_held_barred", Integer(0, LINE_CHARACTERS_MAX + 1)),
+            Field(4, "_overlong", FLAG),
+        ),
+        {"_ledger": DAEMON, "_unknown": "the counts of the codec"},
+    )
 
     def __init__(self, ledger: Ledger, unknown: dict[int, int]) -> None:
         self._ledger = ledger

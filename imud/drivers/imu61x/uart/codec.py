@@ -25,6 +25,7 @@ from imud.attitude.rotation import quat_from_euler_zyx
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, count_unknown
 from imud.contracts.script import Message, ReplyFrame
 from imud.drivers.imu61x.common import CRC_INVERSION, CRC_START, M_S2_PER_G, RAD_S_PER_DEG_S, crc32
+from imud.drivers.state import DAEMON, OPTIONS, UNKNOWN
 from imud.drivers.value_limits import (
     ACCEL_LIMIT_G,
     GYRO_LIMIT_DEG_S,
@@ -34,6 +35,7 @@ from imud.drivers.value_limits import (
     scaled,
 )
 from imud.formats.kernel import KernelFormat, KernelFrames
+from imud.formats.state import Data, Field, Integer, StateTable
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Vector3
@@ -90,6 +92,13 @@ class FrameFinder(KernelFrames):
     """
 
     kernel_format = KernelFormat("AHRS", HEADER.pack(DEVICE_SYNC, AHRS_FRAME, AHRS_BYTES), AHRS_FRAME_BYTES)
+    STATE: ClassVar = StateTable(
+        (
+            Field(1, "_tail", Data(FRAME_BYTES_MAX)),
+            Field(2, "_bad_ahead", Integer(0, OVERHEAD_BYTES + 0xFFFF)),
+        ),
+        {"ledger": DAEMON, "_sync": "set by the constructor"},
+    )
 
     def __init__(self, ledger: Ledger, sync: bytes) -> None:
         super().__init__(ledger)
@@ -348,6 +357,10 @@ class Imu61xCodec:
     kernel_format: ClassVar = FrameFinder.kernel_format
     word_is_status: ClassVar = False
     sample_frame: ClassVar = AHRS_FRAME  # identifier of the frames with measurements
+    STATE: ClassVar = StateTable(
+        (Field(1, "unknown", UNKNOWN), Field(2, "_finder", FrameFinder.STATE)),
+        {"ledger": DAEMON, "_mag_factor": OPTIONS, "_payload_bytes_min": OPTIONS},
+    )
 
     def __init__(self, ledger: Ledger, settings: Options | None = None) -> None:
         self.ledger = ledger

@@ -26,7 +26,9 @@ from imud.drivers.imu61x.uart.codec import (
     Frame,
     Imu61xCodec,
 )
+from imud.drivers.state import OPTIONS
 from imud.drivers.value_limits import ACCEL_LIMIT_G, GYRO_LIMIT_DEG_S, scaled
+from imud.formats.state import StateTable
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Vector3
@@ -80,6 +82,7 @@ class RawCodec(Imu61xCodec):
     """Decoder of raw frames into measurements, and of reply frames. It ignores AHRS frames and counts them."""
 
     sample_frame: ClassVar = RAW_FRAME
+    STATE: ClassVar = StateTable(Imu61xCodec.STATE.fields, {**Imu61xCodec.STATE.other, "_layout": OPTIONS})
 
     def __init__(self, ledger: Ledger, layout: RawFrame) -> None:
         super().__init__(ledger)
