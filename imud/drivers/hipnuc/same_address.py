@@ -84,7 +84,9 @@ def _follow(times_ns: Sequence[int], first: int, step_ns: int, limit_ns: int) ->
     """Return the times of a series, the number of steps to its last time, and the number of periods to the end."""
     begin_ns = times_ns[first]
     taken, due_ns, steps, last = [begin_ns], begin_ns + step_ns, 0, 0
-    while due_ns <= times_ns[-1] + limit_ns:
+    # a series without enough frames for its periods is no result: one long pause contains thousands of periods
+    steps_max = int(len(times_ns) / COVERED) + 1
+    while due_ns <= times_ns[-1] + limit_ns and steps <= steps_max:
         steps += 1
         place = bisect_left(times_ns, due_ns)
         near_ns = min(times_ns[max(place - 1, 0) : place + 1], key=lambda t_ns: abs(t_ns - due_ns))
@@ -145,7 +147,7 @@ class _Watch:
         self.slow_ns = ()
         if len(times_ns) < EXTRAS:
             return
-        series, _ = series_of(times_ns)
+        series, _ = series_of(sorted(times_ns))  # the arrival times of a forged recording can fall
         found = _periods_of([FrameSeries(0, (), 0), *series], times_ns, ())
         if found and now_ns - times_ns[-1] > EXTRAS_END * found[-1]:
             times_ns.clear()
