@@ -16,10 +16,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from time import thread_time_ns
-from typing import Final
+from typing import Final, NamedTuple
 
 from imud import __version__
 from imud import config as configuration
@@ -38,20 +39,19 @@ from imud.contracts.status import DeviceState, DeviceStatus
 from imud.device.device import Device, RecordableDevices
 from imud.device.factory import DeviceFactory
 from imud.device.latency import LatencyBudget
-from imud.drivers import DRIVERS
 from imud.host.clock import HostClock
 from imud.host.event_loop import Alarm
 from imud.host.log import printable
+from imud.host.scope import Scope, ThreadScopes, words_of
 from imud.host.service_manager import ServiceManager, notify
 from imud.lines.driven_line import driving
 from imud.lines.gpio import GPIO_LINES
 from imud.lines.watched_line import watching
-from imud.links import LINKS
-from imud.model.errors import CommandError, ConfigError, ImudError, ServerError
+from imud.model.errors import CommandError, ConfigError, ImudError
 from imud.model.event import Event, EventKind, EventLog
 from imud.model.ledger import NOTHING_LOST
-from imud.model.units import NS_PER_MS
-from imud.publishers.outputs import Outputs, modules_of
+from imud.model.units import NS_PER_MS, NS_PER_S
+from imud.publishers.outputs import FORGOTTEN_NS, RETRY_FIRST_NS, RETRY_MOST_NS, Outputs
 from imud.utc.system_clock import kernel_clock, system_reference
 
 log = logging.getLogger(__name__)
@@ -144,6 +144,22 @@ CONDITION: Final = attrgetter("condition")
 DEVICES_NS: Final = 950 * NS_PER_MS  # minimum time between two ticks of quiet devices, ns: each second tick
 
 
+class DeviceRestart(NamedTuple):
+    """Next start of a device that failed because of an internal error."""
+
+    due_ns: int  # CLOCK_MONOTONIC
+    pause_ns: int
+
+    @classmethod
+    def after(cls, previous: "DeviceRestart | None", now_ns: int) -> "DeviceRestart":
+        """Return the next start after a failure. The pause doubles with each failure, as for outputs."""
+        if previous is None or now_ns - previous.due_ns > FORGOTTEN_NS:
+            pause_ns = RETRY_FIRST_NS
+        else:
+            pause_ns = min(2 * previous.pause_ns, RETRY_MOST_NS)
+        return cls(now_ns + pause_ns, pause_ns)
+
+
 class Daemon:
     """Devices and outputs of one configuration. Synchronization: the loop's thread only.
 
@@ -192,11 +208,14 @@ class Daemon:
             state_dir=state_dir,
             past_events=EventLog(host.now_ns()),
         )
-        self._outputs = Outputs(self._context, extra or {})
+        self._threads = ThreadScopes()
+        self._outputs = Outputs(self._context, extra or {}, self._threads)
         # a direct reference: a method of this class would cost one more call per batch
         self.publish: Final = self._outputs.publish
         self._until_finished = until_finished
         self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._scopes: dict[str, Scope] = {}  # by the name of the device
+        self._restarts: dict[str, DeviceRestart] = {}  # failed devices that imud starts again
         self._ids: dict[str, int] = {}
         self._stop = asyncio.Event()
         self._alarm: Alarm | None = None
@@ -210,14 +229,15 @@ class Daemon:
 
     # --- life ------------------------------------------------------------------------------------------------------
 
-    async def run(self) -> None:
-        """Run until `stop`.
+    async def run(self, on_stopping: "Callable[[BaseException | None], None]" = lambda _error: None) -> None:
+        """Run until `stop`. Call `on_stopping` with the error, or None, before imud closes the devices and outputs.
 
         Raises ServerError if a required output cannot start, and the error that ended the task of a device.
         """
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(self._on_loop_error)
         loop.set_default_executor(_one_thread())
+        self._threads.install(loop)
         if self._file is not None:
             self._reloader = Reloader(self._file, self, self._host)
         try:
@@ -232,7 +252,9 @@ class Daemon:
             await self._tick_until_stopped()
         finally:
             self._manager.stopping()
+            on_stopping(self._failure)
             await self._close()
+            self._threads.remove()
             self._ignore_signals()
             log.info("imud has stopped")
         if self._failure is not None:
@@ -300,9 +322,11 @@ class Daemon:
     def _try_device(self, device: DeviceConfig) -> str:
         try:
             self._start_device(device)
-        except ServerError as error:
-            log.error("%s cannot be started: %s", device.name, error)
-            return f"{device.name} cannot be started: {error}"
+        except Exception as error:
+            is_expected = isinstance(error, ImudError)
+            words = str(error) if is_expected else words_of(error)
+            log.error("%s cannot be started: %s", device.name, words, exc_info=None if is_expected else error)
+            return f"{device.name} cannot be started: {words}"
         return ""
 
     # --- devices and outputs ----------------------------------------------------------------------------------------
@@ -323,7 +347,15 @@ class Daemon:
         for name in list(self._devices):
             device = self._devices.get(name)
             if device is not None:
-                yield device.status()
+                yield self._status_of(name, device)
+
+    def _status_of(self, name: str, device: Device) -> DeviceStatus:
+        """Return the status of a device. Its driver takes part in it: a failure ends the device first."""
+        try:
+            return device.status()
+        except BaseException as error:  # noqa: BLE001 - foreign code can raise any exception
+            self._scopes[name].fail(error)
+            return device.status()
 
     def ledgers(self) -> list[DeviceLedger]:
         """Return the ledgers of all devices."""
@@ -347,31 +379,65 @@ class Daemon:
     def _start_device(self, config: DeviceConfig) -> None:
         device_id = self._ids.setdefault(config.name, len(self._ids))
         self._outputs.add_device(config.name, device_id)
-        device = self._factory.make(config, device_id)
-        self._devices[config.name] = device
-        self._latencies.add_device(config.name, device.set_need)
-        task = asyncio.create_task(device.run(), name=config.name)
+        name = config.name
+        scope = Scope(name, partial(self._on_device_failure, name))
+        device = scope.run(self._factory.make, config, device_id)
+        self._devices[name] = device
+        self._scopes[name] = scope
+        self._latencies.add_device(name, lambda need: scope.call(device.set_need, need))
+        task = scope.task(device.run(), name)
         task.add_done_callback(self._on_done)
-        self._tasks[config.name] = task
+        self._tasks[name] = task
         self.tick_soon()
 
     def _stop_device(self, name: str) -> None:
-        if name in self._tasks:  # False if imud could not start the device
+        self._restarts.pop(name, None)
+        if name in self._devices:  # False if imud could not start the device
             self._tasks.pop(name).cancel()
-            self._devices.pop(name).close()
+            self._scopes.pop(name).close()
+            self._end_part(name, self._devices.pop(name).close)
         self._latencies.remove_device(name)
         if all(device.name != name for device in self.config.devices):
             self._context.past_events.remove(name)
         self._outputs.remove_device(name)
 
-    def _on_done(self, task: asyncio.Task[None]) -> None:
-        """Stop after an internal error in the task of a device. The service manager restarts imud."""
-        error = None if task.cancelled() else task.exception()
-        if error is not None and not (isinstance(error, Exception) and self._take_driver_error(error)):
-            self._failure = error
-            self._stop.set()
+    def _on_done(self, _task: asyncio.Task[None]) -> None:
+        """Stop at the end of the last replay."""
         if self._until_finished and self.finished:
             self._stop.set()
+
+    def _on_device_failure(self, name: str, error: BaseException) -> None:
+        """End a device after an internal error. All other devices and the outputs continue.
+
+        imud starts a device with a driver of imud again after a pause. The driver of another package would fail again:
+        its device ends until the next start of imud, or until a reload changes the device.
+        """
+        if self._until_finished:  # a replay: the calling program reports the error
+            self.end_with(error)
+            return
+        device = self._devices[name]
+        self._tasks[name].cancel()
+        words = str(error) if isinstance(error, ImudError) else words_of(error)
+        if device.is_of_other_package:
+            advice = "imud uses this device again after its next start, or after a change of its configuration"
+        else:
+            restart = DeviceRestart.after(self._restarts.get(name), self._host.now_ns())
+            self._restarts[name] = restart
+            advice = f"imud starts this device again in {restart.pause_ns // NS_PER_S} s"
+        log.error("%s: %s; imud continues without this device", name, words, exc_info=error)
+        device.fail(f"{words}; {advice}")
+        if self._alarm is not None:
+            self.tick_soon()
+
+    def _restart_devices(self, now_ns: int) -> None:
+        """Start the failed devices after their pauses."""
+        for name, restart in list(self._restarts.items()):
+            config = next((device for device in self.config.devices if device.name == name), None)
+            has_failed = name in self._scopes and self._scopes[name].is_closed
+            if config is not None and has_failed and now_ns >= restart.due_ns:
+                self._stop_device(name)
+                self._restarts[name] = restart  # a further failure has a longer pause
+                self._try_device(config)
 
     def _on_reloaded(self, task: asyncio.Task[None]) -> None:
         """Stop after an internal error in a reload."""
@@ -380,39 +446,16 @@ class Daemon:
             self._stop.set()
 
     def _on_loop_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
-        """Restart the output that raised an exception in a callback. Stop after any other internal error."""
+        """Stop after an internal error that belongs to no device and no output."""
         error = context.get("exception")
-        if isinstance(error, Exception) and (self._outputs.take_error(error) or self._take_driver_error(error)):
-            return
         if not isinstance(error, ImudError):  # the caller prints the words of an ImudError
             log.error("%s", context.get("message"), exc_info=error if isinstance(error, BaseException) else None)
-        self._failure = error if isinstance(error, BaseException) else RuntimeError(str(context.get("message")))
+        self.end_with(error if isinstance(error, BaseException) else RuntimeError(str(context.get("message"))))
+
+    def end_with(self, error: BaseException) -> None:
+        """Stop, and raise an error at the end of `run`. The first error is the reason."""
+        self._failure = self._failure or error
         self._stop.set()
-
-    def _take_driver_error(self, error: Exception) -> bool:
-        """Stop using the driver of another package that caused an error. Return False if none caused it.
-
-        Its devices end, and devices that search for their driver start again. A thread serves the devices of a polled
-        bus and has ended, so these devices need a restart of imud.
-        """
-        words = f"internal error {type(error).__name__}: {error}"
-        names = DRIVERS.disable(set(modules_of(error)), words)
-        users = {name for name, device in self._devices.items() if device.status().driver in names}
-        if not names or any(LINKS[one.link].polled for one in self.config.devices if one.name in users):
-            return False
-        log.error("%s: %s; imud stops its devices and continues", ", ".join(names), words, exc_info=error)
-        for one in self.config.devices:
-            ends = one.name in users
-            if ends or (one.name in self._devices and self._devices[one.name].state is not DeviceState.RUNNING):
-                if ends:
-                    text = f"imud does not use {one.name} and the driver {names[0]} until its next start: {words}"
-                    self.send_event(Event(self._host.now_ns(), "", EventKind.CONFIGURATION, text))
-                self._stop_device(one.name)
-                if not ends:
-                    self._start_device(one)
-        if self._alarm is not None:
-            self._alarm.set(TICK_S)  # the error may have ended a tick
-        return True
 
     def send_event(self, event: Event) -> None:
         """Store an event, and pass it to the outputs."""
@@ -437,15 +480,16 @@ class Daemon:
                 self._alarm.set(TICK_S)
 
     def on_alarm(self) -> None:
-        """Call `tick` of all outputs. Call `tick` of all devices once per second, and after `tick_soon`. An error stops
-        the daemon (`_on_loop_error`)."""
+        """Call `tick` of all outputs. Call `tick` of all devices once per second, and after `tick_soon`."""
         assert self._alarm is not None
         now_ns = self._host.now_ns()
         if self._is_soon or now_ns >= self._devices_due_ns:
             self._is_soon, self._devices_due_ns = False, now_ns + DEVICES_NS
             self._host.utc_offset_ns()  # without samples too: the rate of the clock is a mean between two reads
-            for device in self._devices.values():
-                device.tick(now_ns)
+            for name, device in list(self._devices.items()):
+                self._scopes[name].call(device.tick, now_ns)
+            if self._restarts:
+                self._restart_devices(now_ns)
         self._outputs.tick(now_ns)
         self._manager.tick(now_ns, self._status_line)
         self._alarm.set(TICK_S if self._is_soon else QUIET_TICK_S)
@@ -463,6 +507,8 @@ class Daemon:
         tasks = list(self._tasks.values())
         for task in tasks:
             task.cancel()
+        for scope in self._scopes.values():
+            scope.close()
         await asyncio.gather(*tasks, return_exceptions=True)
         for name, device in self._devices.items():
             self._end_part(name, device.close)
@@ -474,7 +520,7 @@ class Daemon:
         """Close a part. Log an error and continue; the first error is the result of `run`."""
         try:
             step()
-        except Exception as error:
+        except BaseException as error:
             log.exception("%s: the end failed", name)
             self._failure = self._failure or error
 

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 from imud import __version__
 from imud.cli.output import complain, discard_output, open_standard_streams
 from imud.host.installation import documents, needs_extra
-from imud.model.errors import ConfigError, ImudError, reason_of
+from imud.host.process_end import end_process
+from imud.model.errors import ConfigError, DriverFailed, ImudError, reason_of
 
 if TYPE_CHECKING:
     from imud.cli.arguments import CliCommand
@@ -100,7 +101,17 @@ def build_parser(commands: Collection[str] = COMMANDS) -> argparse.ArgumentParse
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status. Print an expected error as one line to standard error."""
+    """Run one command and return its exit status. Print an expected error as one line to standard error.
+
+    Without `argv`, the command is the process: threads of other packages do not keep it alive after its end.
+    """
+    status = _run(argv)
+    if argv is None:
+        end_process(status)
+    return status
+
+
+def _run(argv: Sequence[str] | None) -> int:
     # first: an argparse error also needs a usable standard error
     open_standard_streams()
     words = sys.argv[1:] if argv is None else argv
@@ -116,6 +127,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader closed the pipe, for example `imud watch | head`
         discard_output()
         return 0
+    except DriverFailed as error:  # the command ran until the code of another package failed
+        complain(f"imud {name}: {error}")
+        return 1
     except ConfigError as error:  # each line starts with file:line:column, for editors and scripts
         complain(str(error))
     except ImudError as error:

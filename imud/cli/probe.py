@@ -5,7 +5,6 @@ The command only listens. It sends requests only to ports and buses of `--active
 
 import argparse
 import asyncio
-import contextlib
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Final
@@ -30,7 +29,7 @@ from imud.host.netlink import can_details, can_interfaces
 from imud.links import LINKS
 from imud.links.serial_port import list_ports
 from imud.links.socketcan import ControllerState
-from imud.model.errors import CommandError, ImudError, NothingHeard
+from imud.model.errors import CommandError, DriverFailed, ImudError, NothingHeard
 from imud.model.ledger import Ledger
 
 PINGS: Final = 2  # number of requests to a boot loader at each baud rate
@@ -147,9 +146,17 @@ async def identity_of_node(device: CanDevice, link: CanLink) -> Identity:
 
     link.filters = driver.filters(settings)
     link.start(on_frames, lambda news, problem: None, lambda error: None)
-    with suppress(CommandError):
-        return await runner.run(driver.identify(settings))
-    return Identity()
+    return await identity_by(runner, driver.identify(settings))
+
+
+async def identity_by(runner: ScriptRunner, script: RequestScript[Identity]) -> Identity:
+    """Run the script. Return an empty identity if the device does not reply. Raises DriverFailed."""
+    try:
+        return await runner.run(script)
+    except DriverFailed:
+        raise
+    except CommandError:
+        return Identity()
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -284,9 +291,7 @@ async def identity_of_device(found: StreamFound, link: StreamLink) -> Identity:
     runner = ScriptRunner(SerialRequestPort(link), ledger, HostClock())
 
     link.start(receiver_of(codec.feed, runner), lambda error: None)
-    with contextlib.suppress(CommandError):
-        return await runner.run(found.driver.identify())
-    return Identity()
+    return await identity_by(runner, found.driver.identify())
 
 
 PROBE = CliCommand(add_arguments, run)

@@ -20,6 +20,7 @@ from imud.drivers import DRIVERS
 from imud.fleet.settings import EVERY
 from imud.host import event_loop
 from imud.host.log import STDERR, is_journal, log_to
+from imud.host.process_end import STOP_LIMIT_S, EndDeadline
 from imud.model.errors import ConfigError, ImudError, ServerError
 from imud.model.options import unknown_name
 from imud.publishers.rules.settings import RulesOptions
@@ -50,16 +51,19 @@ def run(args: argparse.Namespace) -> int:
         refuse(error)
         return EXIT_CONFIGURATION
     with log_to(STDERR, settings.log_level):
+        deadline = EndDeadline(STOP_LIMIT_S)
         try:
-            event_loop.run(serve(settings, args.config))
+            event_loop.run(serve(settings, args.config, deadline))
         except ServerError as error:
             log.critical("%s", error)
             return EXIT_OUTPUT
         except ImudError:
             raise
-        except Exception:  # top level of the daemon: log the error and set the exit status
+        except (Exception, SystemExit):  # top level of the daemon: log the error and set the exit status
             log.critical("imud stops because of an internal error", exc_info=True)
             return EXIT_INTERNAL
+        finally:
+            deadline.cancel()
     return 0
 
 
@@ -143,11 +147,16 @@ def standard_input() -> bytes:
     return sys.stdin.buffer.read(FILE_BYTES_MAX + 1)  # one more byte: the reader then reports a file that is too long
 
 
-async def serve(settings: Config, file: Path) -> None:
-    """Run the daemon with its signal handlers."""
+async def serve(settings: Config, file: Path, deadline: EndDeadline) -> None:
+    """Run the daemon with its signal handlers. `deadline` limits the time of its stop."""
+
+    def on_stopping(error: BaseException | None) -> None:
+        deadline.status = 0 if error is None else EXIT_INTERNAL
+        deadline.start()
+
     daemon = Daemon(settings, file=file, state_dir=state_dir(settings))
     daemon.install_signals()
-    await daemon.run()
+    await daemon.run(on_stopping)
 
 
 def state_dir(settings: Config) -> Path:

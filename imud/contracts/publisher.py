@@ -21,6 +21,7 @@ from imud.contracts.status import (
     DeviceStatus,
     FlightStatus,
     MqttStatus,
+    OutputState,
     OutputStatus,
     RecorderStatus,
     RulesStatus,
@@ -315,6 +316,17 @@ class OutputFacts:
     without_ring: set[str] = field(default_factory=set)
     # Reason for each output that does not run and that imud starts again
     failed: dict[str, str] = field(default_factory=dict)
+    # Names of the outputs that the configuration enables
+    configured: set[str] = field(default_factory=set)
+
+    def states(self) -> list[OutputState]:
+        """Return the state of each configured output, by name. A running output has the problem of its ports."""
+        problems = self.problems()
+        states = []
+        for name in sorted(self.configured):
+            own = [problem for key, problem in problems.items() if key == name or key.startswith(f"{name} ")]
+            states.append(OutputState(name, name not in self.failed, "; ".join(own)))
+        return states
 
     def problems(self) -> dict[str, str]:
         """Return the problem of each output, or port of an output, that does not work."""
@@ -340,6 +352,10 @@ class OutputOwner(Protocol):
 
     def tick_soon(self) -> None:
         """Tick the outputs within 0.1 s."""
+        ...
+
+    def end_with(self, error: BaseException) -> None:
+        """End imud: an output of the calling program failed."""
         ...
 
 

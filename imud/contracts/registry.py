@@ -7,7 +7,7 @@ first use of a name that is not a row of imud, and at the first iteration.
 import os
 import re
 import sys
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, cached_property
 from importlib import import_module
 from types import MappingProxyType
@@ -38,6 +38,7 @@ class PluginGroup(NamedTuple):
     name: str  # group of the entry points
     row_type: type
     reserved: tuple[str, ...] = ()  # names that have another meaning in the configuration
+    guard: str = ""  # function `module:NAME` that returns a row whose functions raise only errors of imud
 
 
 class Plugin(NamedTuple):
@@ -104,7 +105,6 @@ class Registry(Mapping[str, T], Generic[T]):
         self.kind = kind
         self.rows: Final = MappingProxyType(dict(rows))
         self._group = group
-        self._modules: dict[str, str] = {}  # module of each row of another package
 
     def __getitem__(self, name: str) -> T:
         if name in self.rows:
@@ -127,16 +127,6 @@ class Registry(Mapping[str, T], Generic[T]):
         """Rows of `problems_of`."""
         return self._plugins[1]
 
-    def disable(self, modules: Collection[str], reason: str) -> Sequence[str]:
-        """Remove the rows of other packages with one of these modules. Return their names."""
-        rows, problems = self._plugins
-        packages = {module.partition(".")[0] for module in modules}
-        found = [name for name in rows if self._modules[name].partition(".")[0] in packages]
-        for name in found:
-            del rows[name]
-            problems[name] = f"cannot use the {self.kind} {name}: {reason}"
-        return found
-
     @cached_property
     def _plugins(self) -> tuple[dict[str, T], dict[str, str]]:
         """Rows of other packages by name, and the reasons why imud cannot use a row."""
@@ -156,7 +146,6 @@ class Registry(Mapping[str, T], Generic[T]):
                 problems[point] = f"cannot use the {self.kind} {point} of {packages}: {problem}"
             else:
                 rows[point] = cast(T, row)
-                self._modules[point] = same[0].point.module
         return rows, problems
 
     def _clash(self, name: str, count: int, group: PluginGroup) -> str:
@@ -176,7 +165,7 @@ def _loaded(point: "EntryPoint", group: PluginGroup) -> tuple[Any, str]:
     advice = f"install a version of the package for interface {INTERFACE_VERSION} of imud"
     try:
         found = point.load()
-    except (Exception, SystemExit) as error:  # noqa: BLE001 - foreign code can raise any exception
+    except BaseException as error:  # noqa: BLE001 - foreign code can raise any exception
         got = f"{type(error).__name__}: {error}"
         return None, f"expected the object {point.value}, got {got}; {advice} and the libraries that the package needs"
     expected, got = "", ""
@@ -192,4 +181,6 @@ def _loaded(point: "EntryPoint", group: PluginGroup) -> tuple[Any, str]:
         expected, got = f"name={point.name!r}", f"name={row.name!r}"
     elif getattr(row, "required", False):
         expected, got = "required=False", "required=True"
-    return row, f"expected {expected} at {point.value}, got {got}; {advice}" if expected else ""
+    if expected:
+        return row, f"expected {expected} at {point.value}, got {got}; {advice}"
+    return (load(group.guard)(row) if group.guard else row), ""

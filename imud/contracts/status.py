@@ -333,6 +333,14 @@ class OutputStatus(msgspec.Struct, frozen=True):
     discarded: int = 0  # number of received messages that imud ignored, because they were invalid or above a limit
 
 
+class OutputState(msgspec.Struct, frozen=True):
+    """One configured output."""
+
+    name: str  # key of the output in the configuration
+    running: bool  # whether the output runs; False: imud starts it again after a pause
+    problem: str = ""  # reason why the output or one of its ports does not work; empty if it works
+
+
 class MqttStatus(msgspec.Struct, frozen=True):
     broker: str  # connected broker; empty if no broker is connected
     problem: str  # reason why imud sends nothing, one sentence; empty while imud sends

@@ -22,6 +22,7 @@ from imud.device.search import GaveUp, Listen, SearchRound
 from imud.formats.can import CanFilter, CanFrame
 from imud.formats.j1939 import pgn_name, split
 from imud.host.clock import HostClock
+from imud.model.errors import DriverFailed
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
 from imud.model.units import NS_PER_MS, NS_PER_S
@@ -73,21 +74,38 @@ class CanSurvey:
         self._trials: dict[tuple[str, int], _Trial] = {}
         # Candidates that receive a frame, by identifier. Each received identifier is a key.
         self._listeners: dict[Identifier, tuple[_Trial, ...]] = {}
+        self.failures: dict[str, str] = {}  # problem of each driver of another package that failed
 
     def on_frames(self, frames: Sequence[CanFrame]) -> None:
         """Process frames in the order of arrival."""
         for frame in frames:
-            if frame.after_loss:
-                for trial in self._trials.values():
-                    trial.codec.reset()
-            self._look_for_devices(frame)
-            for trial in self._listening(frame):
-                trial.count(trial.codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns))
+            try:
+                self._on_frame(frame)
+            except DriverFailed as error:
+                self._remove_driver(error)
 
     def flush(self) -> None:
         """Process pending frames at the end of a round."""
-        for trial in self._trials.values():
-            trial.count(trial.codec.flush())
+        for trial in list(self._trials.values()):
+            try:
+                trial.count(trial.codec.flush())
+            except DriverFailed as error:
+                self._remove_driver(error)
+
+    def _on_frame(self, frame: CanFrame) -> None:
+        if frame.after_loss:
+            for trial in self._trials.values():
+                trial.codec.reset()
+        self._look_for_devices(frame)
+        for trial in self._listening(frame):
+            trial.count(trial.codec.feed_frame(frame.can_id, frame.extended, frame.data, frame.t_rx_ns))
+
+    def _remove_driver(self, error: DriverFailed) -> None:
+        """Continue without a driver of another package that failed. The frame counts for no device."""
+        self.failures[error.driver] = str(error)
+        self._drivers = tuple(driver for driver in self._drivers if driver.name != error.driver)
+        self._trials = {key: trial for key, trial in self._trials.items() if key[0] != error.driver}
+        self._listeners.clear()
 
     def devices(self, claimed: Claimed = none_claimed) -> list[CanDevice]:
         """Return the accepted devices that no configured device uses, in the order of their first frames."""
@@ -182,6 +200,9 @@ class CanSearch:
 
     def summary(self) -> str:
         """Return the reason for no result."""
+        return "; ".join([self._result(), *self.survey.failures.values()])
+
+    def _result(self) -> str:
         survey, where = self.survey, self._where
         if devices := survey.devices(self._claimed):
             return f"{len(devices)} devices send on {where}: {_listed(devices)}; configure driver and options"

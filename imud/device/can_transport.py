@@ -22,7 +22,7 @@ from imud.device.transport import (
 )
 from imud.drivers import DRIVERS
 from imud.formats.can import CanFilter, CanFrame, CyclicFrame, frame_bits
-from imud.model.errors import BadArgument, CommandError, LinkError
+from imud.model.errors import BadArgument, CommandError, DriverFailed, LinkError
 from imud.model.event import EventKind
 from imud.model.options import Options, shown
 from imud.model.units import NS_PER_S
@@ -116,16 +116,23 @@ class CanTransport(ReceivingTransport):
         self._bus_problem = ""  # present problem of the bus; empty if there is none
         self._is_wide = False  # whether the link passes all frames that the device can send
         self._conflict = ""  # present conflict of two devices with one address; empty without a conflict
+        # error of the driver of another package at the start; `wait_present` raises it in the task of the device
+        self._start_failure: DriverFailed | None = None
         if not self._searchable:
             driver = DRIVERS[self._config.driver]
             if not isinstance(driver, CanDriver):
                 raise LinkError(f"{self._config.name}: expected a driver for CAN, got {driver.name}")
-            self._set_up(driver, self._config.options or driver.settings())
+            try:
+                self._set_up(driver, self._config.options or driver.settings())
+            except DriverFailed as error:
+                self._start_failure = error
 
     # --- the link ----------------------------------------------------------------------------------------------------
 
     async def wait_present(self) -> None:
         """Return when the bus is up. Raises LinkError if another device sends the frames of this device."""
+        if self._start_failure is not None:
+            raise self._start_failure
         if not self._searchable and not self._joined:
             self._join()
         self._refuse_conflict()

@@ -21,10 +21,6 @@ from imud.contracts.command import (
     Calibrations,
     Kept,
     LastCalibration,
-    Proof,
-    Risk,
-    Verb,
-    VerbResult,
     Verbs,
 )
 from imud.contracts.condition import Condition
@@ -34,25 +30,26 @@ from imud.contracts.link import Link
 from imud.contracts.publisher import PutRecord
 from imud.contracts.status import ClockStatus, DeviceState, DeviceStatus
 from imud.device.attachments import Attachments
-from imud.device.calibration import CalibrationRun, RestWindow, check
+from imud.device.calibration import CalibrationRun
 from imud.device.condition import ConditionJudge, Known
-from imud.device.evidence import STEP_S
 from imud.device.firmware import FirmwareUpdate
 from imud.device.flash import SettingsFiles
 from imud.device.health import NO_SAMPLE, RUNNING, DeviceEvents, Health
 from imud.device.latency import Need
 from imud.device.settings import DeviceSettings, identity_words
-from imud.device.settings_plan import Values, as_json, setting_instead
+from imud.device.settings_plan import setting_instead
 from imud.device.transport import UNHEARD_NS, DeviceContext, DeviceOwner, Transport
+from imud.device.verb_run import VerbRun
 from imud.device.watches import AttitudeWatch, StatusWatch
+from imud.drivers import DRIVERS
 from imud.host.clock import HostClock
 from imud.host.log import printable, shown
+from imud.host.scope import words_of
 from imud.links import LINKS
-from imud.model.errors import BadArgument, ImudError, LinkBusy, LinkError, LinkMissing
+from imud.model.errors import BadArgument, LinkBusy, LinkError, LinkMissing
+from imud.model.event import EventKind
 from imud.model.ledger import Ledger
-from imud.model.options import Options
-from imud.model.options import shown as json_words
-from imud.model.units import NS_PER_MS, NS_PER_S, RAD_PER_DEG
+from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.recording.observer import ClockObserver, PathObserver
 from imud.sampling.meters import LatencyMeter
 from imud.sampling.path import SamplePath
@@ -69,8 +66,6 @@ SILENCE_NS = 1 * NS_PER_S  # minimum time without a sample that makes a device s
 WATCHED: Final = (DeviceState.SEARCHING, DeviceState.SILENT)  # states that end with the first sample
 SILENCE_PERIODS = 5  # minimum number of sample periods without a sample that makes a device silent
 
-CHANGES_MAX: Final = 5  # maximum number of changed settings in the evidence of a reset
-
 MakeTransport = Callable[[DeviceContext], Transport]
 
 
@@ -82,132 +77,6 @@ class SharedParts:
     host: HostClock
     lines: LineFactory
     files: SettingsFiles
-
-
-class VerbRun:
-    """Execution of verbs. Synchronization: the loop's thread only."""
-
-    def __init__(self, settings: DeviceSettings, transport: Transport) -> None:
-        self._settings = settings
-        self._transport = transport
-        self._samples = transport.samples
-
-    # --- a verb -----------------------------------------------------------------------------------------------------
-
-    async def run(self, name: str, verb: Verb, given: Mapping[str, Any]) -> object:
-        """Run a verb of the driver and return its result: a value, or a `VerbResult` if the verb has an effect.
-
-        Raises CommandError, TransferError, DeviceRefused, LinkError.
-        """
-        settings, arguments = self._settings, verb.arguments(given)
-        async with settings.lock.hold(f"the command {name}"):
-            if verb.saves:
-                settings.spend_flash()
-            if verb.risk is Risk.RESET:
-                await settings.back_up(name)
-            before, was_unsaved = settings.values, settings.is_unsaved
-            is_quiet = await self._samples.is_quiet() if verb.proof is Proof.ONE_SAMPLE else True
-            self._samples.mark()
-            restarts, unsaved = verb.effect_on_flash(arguments)
-            answer = await self._changed(verb, arguments, restarts=restarts, unsaved=unsaved)
-            verified: bool | None = True
-            evidence = verb.evidence
-            match verb.proof:
-                case Proof.VALUE:
-                    return answer
-                case _ if isinstance(answer, VerbResult):  # the script has checked the effect
-                    verified, evidence, answer = answer.verified, answer.evidence, answer.result
-                    if restarts:
-                        verified = verified or None  # changed settings can show the restart below
-                    elif verified and await self._samples.has_restarted():
-                        verified, evidence = False, "the device restarted during the command"
-                case Proof.NONE:
-                    verified = False
-                case Proof.RESTART:
-                    verified, evidence = await self._samples.evidence(verb.proof, is_quiet)
-                case Proof.SETTINGS:
-                    after = settings.values if settings.is_current else {}
-                    verified, evidence = _reset(before, after, was_unsaved)
-                case Proof.SAMPLES:
-                    verified, evidence = await self._agrees(verb, arguments)
-                case Proof.STREAM | Proof.ONE_SAMPLE:
-                    verified, evidence = await self._samples.evidence(verb.proof, is_quiet)
-            if restarts and before and verb.proof is not Proof.SETTINGS and (lost := _changes(before, settings.values)):
-                verified, evidence = verified is not False, f"{evidence}; the restart changed settings: {lost}"
-            return VerbResult(bool(verified), evidence, answer, settings.not_saved if unsaved else "")
-
-    async def run_line(self, name: str, given: Mapping[str, Any], attachments: Attachments) -> VerbResult:
-        """Run a verb of the GPIO lines and return its evidence. Raises BadArgument, CommandError."""
-        proof = attachments.verbs[name].proof
-        is_quiet = await self._samples.is_quiet() if proof is Proof.ONE_SAMPLE else True
-        self._samples.mark()
-        await attachments.run_verb(name, given)
-        verified, evidence = await self._samples.evidence(proof, is_quiet)
-        return VerbResult(bool(verified), evidence)
-
-    async def _changed(self, verb: Verb, arguments: Options, *, restarts: bool, unsaved: bool) -> object:
-        """Run the script, and read the values that it can change."""
-        settings = self._settings
-        settings.script_follows(changes=verb.changes)
-        try:
-            answer: object = await self._transport.run_script(verb.script, arguments)
-        except BadArgument:  # a script checks its arguments before it changes anything
-            raise
-        except BaseException as error:  # the state of the device is unknown
-            settings.changed(unsaved=unsaved or verb.saves)
-            if isinstance(error, ImudError):
-                await settings.read_again(identity=True)
-            raise
-        if verb.saves or restarts:
-            settings.flash_is_current(changed=restarts or verb.changes)
-        if verb.changes:
-            settings.changed(unsaved=unsaved)
-            await settings.read_again(identity=restarts)
-        return answer
-
-    # --- evidence ----------------------------------------------------------------------------------------------------
-
-    async def _agrees(self, verb: Verb, arguments: Options) -> tuple[bool, str]:
-        """Return whether the samples at rest have the values that the verb sets."""
-        expected = verb.expected(arguments)
-        if not expected:
-            return False, "the device confirmed it, and no sample shows its effect"
-        window, sample = RestWindow(), self._samples.newest
-        while not window.full:
-            sample = await self._samples.next(sample)
-            if sample is None:
-                return False, "the device confirmed it, and sends no samples that show its effect"
-            window.add(sample)
-            await asyncio.sleep(STEP_S)
-        if moved := window.motion():
-            return False, f"the device moves: {moved}"
-        checks = [check(one, window.means()) for one in expected]
-        words = ", ".join(
-            f"{one.name} differs by " + ("an unknown angle" if one.value is None else f"{one.value / RAD_PER_DEG:.2f}°")
-            for one in checks
-        )
-        return all(one.passed for one in checks), f"{words} from the set value"
-
-
-def _changes(before: Values, after: Values) -> str:
-    """Describe the settings with another value than before; empty if there are none."""
-    changed = [name for name in after if as_json(after[name]) != as_json(before.get(name))]
-    return ", ".join(
-        f"{name} is {json_words(as_json(after[name]))}, was {json_words(as_json(before.get(name)))}"
-        for name in changed[:CHANGES_MAX]
-    )
-
-
-def _reset(before: Values, after: Values, was_unsaved: bool) -> tuple[bool, str]:
-    """Return whether a reset changed the settings. A restart alone changes only settings that were not saved."""
-    changes = _changes(before, after)
-    if not after:
-        return False, "the device reports no settings after it"
-    if not changes:
-        return False, "the device reports the same settings before and after it"
-    if was_unsaved:
-        return False, f"a restart alone loses the settings that were not saved: {changes}"
-    return True, changes
 
 
 class Device:
@@ -244,6 +113,7 @@ class Device:
         self._is_slow = True  # whether the sample period is longer than IDLE_FLUSH_NS, or not known
         self._is_quick = False  # whether a tick can end immediately while samples arrive and no command runs
         self._connects = 0
+        self._has_failed = False  # whether an internal error has ended the device
         self._need = Need(0, "")
         self._ended: asyncio.Future[LinkError | None] | None = None
 
@@ -281,6 +151,10 @@ class Device:
         """Update the state, detect an idle link, and send collected events. Called once per second, and ten times per
         second while `_needs_ticks`. While samples arrive, the work is due once per second."""
         transport, health, judge, path = self._transport, self._health, self._judge, self._transport.path
+        if self._has_failed:
+            if now_ns >= judge.due_ns:
+                self._judge_condition(now_ns)
+            return
         has_news = path is None or now_ns - path.last_sample_ns > IDLE_FLUSH_NS or health.state is not RUNNING
         is_due = now_ns >= judge.due_ns
         is_quick = self._is_quick and not (has_news or transport.busy or self.settings.lock.work is not None)
@@ -352,6 +226,28 @@ class Device:
     def close(self) -> None:
         """Release the link. A second call does nothing."""
         self._transport.close()
+
+    @property
+    def is_of_other_package(self) -> bool:
+        """Whether the driver is part of another package."""
+        driver = self._transport.driver or DRIVERS.get(self.config.driver)
+        return driver is not None and driver.interface != 0
+
+    def fail(self, problem: str) -> None:
+        """End the device after an internal error. Its status shows `problem`. imud calls its driver no more."""
+        now_ns = self._host.now_ns()
+        was_streaming = self._health.streaming
+        self._has_failed = True
+        for step in (self._attachments.close, self._transport.close):
+            try:
+                step()
+            except BaseException as error:  # noqa: BLE001 - the parts of a failed device can fail again
+                log.error("%s: its end failed: %s", self.config.name, words_of(error))
+        self._transport.forget_driver()
+        self._health.down(now_ns, DeviceState.FAILED, problem)
+        if not was_streaming:
+            self._events.raise_event(now_ns, EventKind.DOWN, problem, state=str(DeviceState.FAILED))
+        self._judge_condition(now_ns)
 
     # --- the link ----------------------------------------------------------------------------------------------------
 

@@ -24,8 +24,9 @@ from imud.contracts.script import Message
 from imud.contracts.status import DeviceState, DeviceStatus, LinesStatus, PollingStatus
 from imud.device.attachments import Attachments
 from imud.device.health import DeviceEvents
-from imud.device.polled_bus import BusMember, Deadlines, PolledBuses, ReadySchedule
+from imud.device.polled_bus import BusMember, PolledBuses
 from imud.device.settings import DeviceSettings
+from imud.device.timetable import Deadlines, ReadySchedule
 from imud.device.transport import UNHEARD_NS, DeviceContext, Transport
 from imud.drivers import DRIVERS
 from imud.host.clock import HostClock

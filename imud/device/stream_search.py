@@ -12,7 +12,7 @@ Random bytes contain a sync word and a length of HiPNUC with 2⁻²³ per byte: 
 of 1,000 bytes. With more bad frames, SURE_FRAMES = 4 good frames are enough: C(60, 4) × 2⁻⁶⁴ = 3 × 10⁻¹⁴.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -24,7 +24,7 @@ from imud.contracts.script import Request
 from imud.device.search import GaveUp, Listen, RememberedDevice, SearchRound
 from imud.drivers import DRIVERS
 from imud.host.clock import HostClock
-from imud.model.errors import LinkError
+from imud.model.errors import DriverFailed, LinkError
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_MS, uart_byte_ns
 
@@ -92,6 +92,7 @@ class Search:
         self._tallies = {baud: _Tally() for baud in self._bauds}
         self._heard_bytes = 0
         self._asked = False
+        self._failures: dict[str, str] = {}  # problem of each driver of another package that failed
         self._started_ns = self._now_ns = 0
         self._plan = self._visits()
         self._visit = _Visit(self._bauds[0], 0)
@@ -105,7 +106,8 @@ class Search:
         visit = self._visit
         self._heard_bytes += len(data)
         before = visit.good_frames()
-        visit.on_data(data, t_rx_ns)
+        visit.add(data, t_rx_ns)
+        self._try_each(lambda trial: visit.look_for_reply(trial, trial.codec.feed(data)))
         if found := self._found():
             return found
         if visit.size > VISIT_BYTES_MAX:
@@ -124,7 +126,7 @@ class Search:
         if now_ns < visit.until_ns:
             return None
         before = visit.good_frames()
-        visit.flush()
+        self._try_each(lambda trial: visit.look_for_reply(trial, trial.codec.flush()))
         if found := self._found():
             return found
         if visit.good_frames() > before:
@@ -170,7 +172,11 @@ class Search:
                 if self._heard_bytes or self._tallies[baud].refusal:
                     break
                 self._asked = True
-                question = next(driver.identify())
+                try:
+                    question = next(driver.identify())
+                except DriverFailed as error:
+                    self._remove_driver(error)
+                    continue
                 dwell_ns = ASK_NS + QUERY_BYTES * uart_byte_ns(baud)
                 yield _Visit(baud, dwell_ns, question=question, asked=driver)
 
@@ -187,7 +193,29 @@ class Search:
 
     def _trials(self, baud: int) -> list["_Trial"]:
         fitting = [driver for driver in self._drivers if baud in driver.baud_rates]
-        return [_Trial(driver, self._options) for driver in fitting or self._drivers]
+        trials = []
+        for driver in fitting or self._drivers:
+            try:
+                trials.append(_Trial(driver, self._options))
+            except DriverFailed as error:
+                self._remove_driver(error)
+        return trials
+
+    def _try_each(self, step: "Callable[[_Trial], None]") -> None:
+        """Call a function with each trial of the present visit. Continue without a driver that failed."""
+        for trial in list(self._visit.trials):
+            try:
+                step(trial)
+            except DriverFailed as error:
+                self._remove_driver(error)
+
+    def _remove_driver(self, error: DriverFailed) -> None:
+        """Continue without a driver of another package. Raises the error if no other driver remains."""
+        self._failures[error.driver] = str(error)
+        self._drivers = [driver for driver in self._drivers if driver.name != error.driver]
+        self._visit.trials = [trial for trial in self._visit.trials if trial.driver.name != error.driver]
+        if not self._drivers:
+            raise error
 
     def _dwell_ns(self, flow_ns: int) -> int:
         """Return the duration of a visit that waits `flow_ns` for bytes."""
@@ -209,6 +237,9 @@ class Search:
         return None
 
     def _summary(self) -> str:
+        return "; ".join([self._result(), *self._failures.values()])
+
+    def _result(self) -> str:
         names = " or ".join(driver.name for driver in self._drivers)
         rates = ", ".join(str(baud) for baud, tally in self._tallies.items() if not tally.refusal)
         if rates and not self._heard_bytes:
@@ -278,20 +309,14 @@ class _Visit:
     def begin(self, trials: list[_Trial], now_ns: int, until_ns: int) -> None:
         self.trials, self.started_ns, self.until_ns = trials, now_ns, until_ns
 
-    def on_data(self, data: bytes, t_rx_ns: int) -> None:
+    def add(self, data: bytes, t_rx_ns: int) -> None:
         self.chunks.append((data, t_rx_ns))
         self.size += len(data)
-        for trial in self.trials:
-            self._look_for_reply(trial, trial.codec.feed(data))
-
-    def flush(self) -> None:
-        for trial in self.trials:
-            self._look_for_reply(trial, trial.codec.flush())
 
     def good_frames(self) -> int:
         return max((trial.good_frames() for trial in self.trials), default=0)
 
-    def _look_for_reply(self, trial: _Trial, events: Sequence[CodecEvent]) -> None:
+    def look_for_reply(self, trial: _Trial, events: Sequence[CodecEvent]) -> None:
         """Detect a complete reply. The end alone (`OK`) is not enough, because many devices send it."""
         question = self.question
         if question is None or trial.driver is not self.asked:

@@ -27,7 +27,7 @@ from imud.device.transport import (
 from imud.drivers import DRIVERS
 from imud.host.clock import HostClock
 from imud.host.event_loop import Alarm
-from imud.model.errors import BadArgument, CommandError
+from imud.model.errors import BadArgument, CommandError, DriverFailed
 from imud.model.event import EventKind
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
@@ -257,6 +257,8 @@ class StreamTransport(ReceivingTransport):
                 return
             try:
                 acknowledged = await self.scripts.run(driver.wake())
+            except DriverFailed:
+                raise
             except CommandError as error:
                 log.debug("%s: not woken: %s", self._config.name, error)
                 continue

@@ -33,7 +33,7 @@ from imud.device.search import Remembered, SearchRound
 from imud.device.settings import DeviceSettings
 from imud.device.settings_plan import SettingsPort
 from imud.host.clock import HostClock
-from imud.model.errors import BadArgument, CommandError, NothingHeard
+from imud.model.errors import BadArgument, CommandError, DriverFailed, NothingHeard
 from imud.model.event import Event, EventKind
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_S
@@ -165,6 +165,10 @@ class Transport(SettingsPort):
     def close(self) -> None:
         """Stop, and release all resources that devices share. A second call does nothing."""
         self.stop()
+
+    def forget_driver(self) -> None:
+        """Use the driver no more: its code has failed."""
+        self.driver = self.path = None
 
     # --- requests ----------------------------------------------------------------------------------------------------
 
@@ -354,6 +358,8 @@ class ReceivingTransport(Transport, RequestPort):
                 await settings.read()
                 settings.answered = True
                 return True
+            except DriverFailed:  # each try would fail
+                raise
             except CommandError as error:
                 log.info("%s: %s (try %d of %d)", self._config.name, error, attempt, tries)
         return False

@@ -17,5 +17,5 @@ DRIVERS: Registry[Driver] = Registry(
         "imu61x-spi": "imud.drivers.imu61x.spi:DRIVER",
         "imu61x-can": "imud.drivers.imu61x.can:DRIVER",
     },
-    PluginGroup("imud.drivers", Driver, reserved=("auto",)),
+    PluginGroup("imud.drivers", Driver, reserved=("auto",), guard="imud.drivers.foreign:guarded_driver"),
 )

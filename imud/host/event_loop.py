@@ -13,14 +13,18 @@ If a turn only called readers, the selector waits again. An asyncio turn would d
 timer is due. The selector returns at its timeout, at an asyncio event, or if a reader gave the loop a callback, a timer
 or `stop`. Other threads and signals wake the loop through a descriptor of asyncio.
 
+Each callback belongs to a `Scope`: the scope of the code that scheduled it. The selector notes the running descriptor
+or alarm, so that code of a reader passes on the scope of this reader.
+
 The end of a hold and the tick of the daemon use an `Alarm`. The selector calls it like a reader. A timer of asyncio
 costs a handle and a complete turn of asyncio, about 15,000 instructions.
 """
 
 import asyncio
+import logging
 import select
 import selectors
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Generator
 from contextlib import suppress
 from contextvars import Context
 from functools import partial
@@ -30,10 +34,24 @@ from math import inf
 from time import monotonic
 from typing import Any, Final, Protocol, TypeVar, TypeVarTuple
 
+from imud.host.scope import (
+    INHERITED,
+    INNERMOST,
+    OwnedFuture,
+    OwnedTask,
+    Scope,
+    scope_of_error,
+    scope_of_report,
+)
+
+log = logging.getLogger(__name__)
+
 T = TypeVar("T")
 Arguments = TypeVarTuple("Arguments")
 
 EVENTS_MAX: Final = 256  # maximum number of descriptors in one turn; the next turn handles all others
+NO_FD: Final = -1  # in place of the descriptor of a reader: none is running
+ALARM_FD: Final = -2  # an alarm is running
 _NUMBERS: Final = count()  # numbers of the calls of `Alarm.set`, which make equal due times comparable
 
 OnError = Callable[[dict[str, Any]], None]  # `loop.call_exception_handler`
@@ -64,7 +82,7 @@ class AlarmOwner(Protocol):
 class Alarm:
     """A timer that one owner sets again and again. Synchronization: the thread of the event loop."""
 
-    __slots__ = ("_alarms", "_handle", "_loop", "due_s", "on_alarm")
+    __slots__ = ("_alarms", "_handle", "_loop", "due_s", "on_alarm", "scope")
 
     def __init__(self, owner: AlarmOwner) -> None:
         """Call `owner.on_alarm` in the running loop each time that the alarm is due. The alarm is not set."""
@@ -72,6 +90,7 @@ class Alarm:
         self.on_alarm = owner.on_alarm
         self._loop = loop = asyncio.get_running_loop()
         self._alarms = loop.alarms if isinstance(loop, SampleLoop) else None
+        self.scope = loop.present_scope() if isinstance(loop, SampleLoop) else None
         self._handle: asyncio.TimerHandle | None = None  # timer of a loop that has no alarms
 
     def set(self, delay_s: float) -> None:
@@ -108,6 +127,9 @@ class ReaderSelector(selectors.EpollSelector):
         # Whether the loop received a callback, a timer or `stop` since the wait started. Set by the loop.
         self.has_news = False
         self._readers: dict[int, Callable[[], object]] = {}
+        self._scopes: dict[int, Scope] = {}  # scope of each descriptor, also after `remove`: the reader may still run
+        self.running_fd = NO_FD  # descriptor of the running reader
+        self.running_alarm: Alarm | None = None
         # Descriptors that were removed in the present turn. The kernel may already use the number for another file.
         self._removed: set[int] = set()
         # Heap of due times (`Alarm.set`). An entry is void if the alarm has another due time now.
@@ -117,9 +139,13 @@ class ReaderSelector(selectors.EpollSelector):
         self._inner = self.fileno()
         self._outer.register(self._inner, select.EPOLLIN)
 
-    def add(self, fd: int, callback: Callable[[], object]) -> None:
+    def add(self, fd: int, callback: Callable[[], object], scope: Scope | None = None) -> None:
         """Call `callback` in each turn in which the descriptor is readable, in place of its previous callback."""
         self._readers[fd] = callback
+        if scope is not None:
+            self._scopes[fd] = scope
+        else:
+            self._scopes.pop(fd, None)
         try:
             self._outer.register(fd, select.EPOLLIN)
         except FileExistsError:
@@ -153,15 +179,23 @@ class ReaderSelector(selectors.EpollSelector):
                     if fd == self._inner:
                         found = super().select(0)
                 elif not removed or fd not in removed:
+                    self.running_fd = fd
                     try:
                         callback()
-                    except Exception as error:  # noqa: BLE001 - asyncio does the same with the callback of a handle
-                        self._failed(callback, error)
+                    except BaseException as error:  # noqa: BLE001 - it belongs to the scope of the reader
+                        self._failed(callback, error, self._scopes.get(fd))
             now_s = monotonic()
             if due_s <= now_s:  # an alarm that a reader has set rings after the next poll
                 self._ring(now_s)
             if found or self.has_news or end_s <= now_s:
+                self.running_fd = NO_FD
                 return found
+
+    def running_scope(self) -> Scope | None:
+        """Return the scope of the running reader or alarm; None if none is running."""
+        if self.running_fd == ALARM_FD:
+            return self.running_alarm.scope if self.running_alarm is not None else None
+        return self._scopes.get(self.running_fd)
 
     def close(self) -> None:
         """Release both descriptors. A second call does nothing."""
@@ -177,17 +211,23 @@ class ReaderSelector(selectors.EpollSelector):
             due_s, _, alarm = heappop(alarms)
             if due_s == alarm.due_s:
                 alarm.due_s = None
+                self.running_fd, self.running_alarm = ALARM_FD, alarm
                 try:
                     alarm.on_alarm()
-                except Exception as error:  # noqa: BLE001 - as for a reader
-                    self._failed(alarm.on_alarm, error)
+                except BaseException as error:  # noqa: BLE001 - as for a reader
+                    self._failed(alarm.on_alarm, error, alarm.scope)
 
-    def _failed(self, callback: Callable[[], object], error: Exception) -> None:
-        self.on_error({"message": f"Exception in reader {callback!r}", "exception": error})
+    def _failed(self, callback: Callable[[], object], error: BaseException, scope: Scope | None) -> None:
+        """Report an error of a reader. Without a scope, SystemExit and KeyboardInterrupt end the loop as in asyncio."""
+        if scope is None and isinstance(error, SystemExit | KeyboardInterrupt):
+            raise error
+        self.on_error({"message": f"Exception in reader {callback!r}", "exception": error, "scope": scope})
 
 
 class SampleLoop(asyncio.SelectorEventLoop):
-    """Event loop with cheap readers. A reader runs without a context (contextvars) and without a task."""
+    """Event loop with cheap readers. A reader runs without a context (contextvars) and without a task.
+
+    Each callback, task and future has the scope of the code that made it."""
 
     def __init__(self, selector: ReaderSelector | None = None) -> None:
         self._reader_selector = selector or ReaderSelector()
@@ -198,7 +238,14 @@ class SampleLoop(asyncio.SelectorEventLoop):
         self, callback: Callable[[*Arguments], object], *args: *Arguments, context: Context | None = None
     ) -> asyncio.Handle:
         """Call `callback` with `args` in the next turn."""
-        self._reader_selector.has_news = True
+        selector = self._reader_selector
+        selector.has_news = True
+        if context is None:  # `_context`, without its calls
+            scope = INNERMOST.scope
+            if scope is not None:
+                context = scope.context
+            elif selector.running_fd != NO_FD:
+                context = self._context()
         return super().call_soon(callback, *args, context=context)
 
     def call_at(
@@ -206,7 +253,68 @@ class SampleLoop(asyncio.SelectorEventLoop):
     ) -> asyncio.TimerHandle:
         """Call `callback` with `args` at a time of the loop's clock; also used by `call_later`."""
         self._reader_selector.has_news = True
-        return super().call_at(when, callback, *args, context=context)
+        return super().call_at(when, callback, *args, context=context if context is not None else self._context())
+
+    def create_task(
+        self,
+        coro: Generator[Any, None, T] | Coroutine[Any, Any, T],
+        *,
+        name: object = None,
+        context: Context | None = None,
+    ) -> asyncio.Task[T]:
+        """Start a task in `context`, or in the scope of the calling code."""
+        if context is None:
+            outer = self._context()
+            context = None if outer is None else outer.copy()
+        scope = INHERITED.get() if context is None else context.get(INHERITED)
+        if scope is None:
+            return super().create_task(coro, name=name, context=context)
+        task = OwnedTask(coro, loop=self, name=None if name is None else str(name), context=context)
+        task.scope = scope
+        return task
+
+    def create_future(self) -> asyncio.Future[Any]:
+        """Return a future of the present scope."""
+        scope = self.present_scope()
+        if scope is None:
+            return super().create_future()
+        future = OwnedFuture(loop=self)
+        future.scope = scope
+        return future
+
+    def present_scope(self) -> Scope | None:
+        """Return the scope of the running code; None if it belongs to no scope."""
+        return INNERMOST.scope or self._reader_selector.running_scope() or INHERITED.get()
+
+    def _context(self) -> Context | None:
+        """Return the context of the innermost scope; None if this scope is that of the present context."""
+        scope = INNERMOST.scope or self._reader_selector.running_scope()
+        return None if scope is None else scope.context
+
+    def call_exception_handler(self, context: dict[str, Any]) -> None:
+        """Report an error to its scope. The handler of the loop receives all other errors."""
+        scope = scope_of_report(context)
+        error = context.get("exception")
+        if scope is None:
+            super().call_exception_handler(context)
+        elif isinstance(error, BaseException):
+            scope.fail(error)
+        else:
+            log.warning("%s: %s", scope.owner, context.get("message"))
+
+    def run_forever(self) -> None:
+        """Run until `stop`. A SystemExit or KeyboardInterrupt in a scope is a failure of its owner, and the loop
+        continues. asyncio stops at such an exception, and keeps all other callbacks."""
+        while True:
+            try:
+                super().run_forever()
+            except (SystemExit, KeyboardInterrupt) as error:
+                scope = scope_of_error(error)
+                if scope is None:
+                    raise
+                scope.fail(error)
+            else:
+                return
 
     def stop(self) -> None:
         """End `run_forever` after this turn."""
@@ -220,7 +328,17 @@ class SampleLoop(asyncio.SelectorEventLoop):
 
     def add_reader(self, fd: Any, callback: Callable[[*Arguments], Any], *args: *Arguments) -> None:
         """Call `callback` with `args` in each turn in which `fd`, a descriptor or a file, is readable or at its end."""
-        self._reader_selector.add(_number_of(fd), partial(callback, *args) if args else callback)
+        number = _number_of(fd)
+        self._reader_selector.add(number, partial(callback, *args) if args else callback, self.present_scope())
+
+    def add_writer(self, fd: Any, callback: Callable[[*Arguments], Any], *args: *Arguments) -> None:
+        """Call `callback` with `args` in each turn in which `fd` accepts data."""
+        context = self._context()
+        if context is None:
+            super().add_writer(fd, callback, *args)
+        else:
+            add: Callable[..., None] = super().add_writer
+            context.copy().run(add, fd, callback, *args)
 
     def remove_reader(self, fd: Any) -> bool:
         """Remove the reader of a descriptor, also of asyncio itself (`sock_recv`, …). Return whether it existed."""

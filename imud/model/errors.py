@@ -9,6 +9,7 @@ ImudError
  ├─ CommandError         failed command to a device
  │   ├─ BadArgument      imud cannot send it: an argument is out of range
  │   │   └─ IsSetting    the command was removed: a setting replaces it
+ │   ├─ DriverFailed     error in the code of a driver of another package
  │   ├─ NoReply          no reply before the timeout
  │   └─ Rejected         the device rejected the command
  ├─ TransferError        one failed transfer on a bus; the next transfer may succeed
@@ -66,6 +67,14 @@ class IsSetting(BadArgument):
     def __init__(self, message: str, settings: Mapping[str, Any], *, save: bool) -> None:
         super().__init__(message)
         self.data: Mapping[str, Any] = {"settings": settings, "save": save}
+
+
+class DriverFailed(CommandError):
+    """Error in a driver of another package. Example: an exception in its decoder, or a vector of two values."""
+
+    def __init__(self, driver: str, message: str) -> None:
+        super().__init__(f"the driver {driver} of another package failed: {message}")
+        self.driver = driver
 
 
 class NoReply(CommandError):

@@ -1,14 +1,18 @@
 """The running outputs of the daemon: start, restart after a failure, end.
 
-An exception in an output never stops the devices and the other outputs. imud closes the failed output and starts it
-again after a pause, which doubles with each failure.
+Each output runs in a scope (`imud.host.scope`): an exception of any class, in a method, a callback, a task or a thread
+of an output, never stops the devices and the other outputs. imud closes the failed output and starts it again after a
+pause, which doubles with each failure.
 """
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+import threading
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Final, NamedTuple
 
 from imud.contracts.publisher import Batch, Publisher, PublisherContext
+from imud.host.scope import INNERMOST, Scope, ThreadScopes, words_of
 from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
 from imud.model.options import Options
@@ -31,21 +35,31 @@ class _Failure(NamedTuple):
     words: str  # reason for the log, the status and the event
 
 
+class _Running(NamedTuple):
+    """A running output."""
+
+    publisher: Publisher
+    scope: Scope
+    publish: Callable[[Batch], None] | None  # None: the output does not process samples
+
+
 class Outputs:
     """Outputs of the daemon by their name. Synchronization: the loop's thread only.
 
-    `extra` contains outputs of the calling program in addition to the configured outputs. Their exceptions are not
-    caught: the program wants to know them.
+    `extra` contains outputs of the calling program in addition to the configured outputs. Their exceptions are failures
+    of the program and end imud.
     """
 
-    def __init__(self, context: PublisherContext, extra: Mapping[str, Publisher]) -> None:
+    def __init__(self, context: PublisherContext, extra: Mapping[str, Publisher], threads: ThreadScopes) -> None:
+        """`threads` notes the threads of each output."""
         self._context = context
         self._extra = extra
+        self._threads = threads
         self._options: dict[str, Options] = {}
-        self._running: dict[str, Publisher] = {}
-        # name and `publish` of all outputs that process samples
-        self._with_samples: tuple[tuple[str, Callable[[Batch], None]], ...] = ()
-        self._ticked: tuple[tuple[str, Publisher], ...] = ()  # running outputs
+        self._running: dict[str, _Running] = {}
+        self._ticked: tuple[_Running, ...] = ()  # running outputs
+        # scope and `publish` of all outputs that process samples
+        self._with_samples: tuple[tuple[Scope, Callable[[Batch], None]], ...] = ()
         self._devices: dict[str, int] = {}  # numbers of the present devices
         self._failures: dict[str, _Failure] = {}
 
@@ -57,12 +71,12 @@ class Outputs:
         for name in options:
             try:
                 self._start(name)
-            except Exception as error:
+            except BaseException as error:
                 if PUBLISHERS[name].required:
                     raise
                 self._fail(name, error)
         for name, publisher in self._extra.items():
-            self._run(name, publisher)
+            self._run(name, partial(_same, publisher))
             self._context.latencies.ask(name, 0)
 
     def change_to(self, name: str, options: Options) -> str:
@@ -72,7 +86,7 @@ class Outputs:
         self._end(name)
         try:
             self._start(name)
-        except Exception as error:
+        except BaseException as error:
             problem = f"{name} keeps its old options: {_words(error)}"
             log.error("%s", problem, exc_info=_unexpected(error))
             self._options[name] = old
@@ -83,10 +97,10 @@ class Outputs:
     def close(self) -> BaseException | None:
         """Let each output send its last data, and release everything. Return the first exception."""
         first: BaseException | None = None
-        for name, publisher in list(self._running.items()):
+        for name, running in list(self._running.items()):
             try:
-                publisher.tick(self._context.clock.now_ns())
-            except Exception as error:
+                running.scope.run(running.publisher.tick, self._context.clock.now_ns())
+            except BaseException as error:
                 log.exception("%s: the end failed", name)
                 first = first or error
             error_at_end = self._end(name)
@@ -108,43 +122,41 @@ class Outputs:
     def add_device(self, name: str, device_id: int) -> None:
         """Prepare all outputs for a device."""
         self._devices[name] = device_id
-        for output in list(self._running):
-            self._guard(output, lambda publisher: publisher.add_device(name, device_id))
+        for running in list(self._running.values()):
+            if not running.scope.is_closed:
+                running.scope.call(running.publisher.add_device, name, device_id)
 
     def remove_device(self, name: str) -> None:
         self._devices.pop(name, None)
-        for output in list(self._running):
-            self._guard(output, lambda publisher: publisher.remove_device(name))
+        for running in list(self._running.values()):
+            if not running.scope.is_closed:
+                running.scope.call(running.publisher.remove_device, name)
 
     def publish(self, batch: Batch) -> None:
         """Pass samples of a device to the outputs."""
-        for name, publish in self._with_samples:
-            try:
-                publish(batch)
-            except Exception as error:  # noqa: BLE001 - an internal error of one output
-                self._fail(name, error)
+        outer = INNERMOST.scope
+        try:
+            for scope, publish in self._with_samples:
+                INNERMOST.scope = scope  # `scope.call` would cost a call for each output and batch
+                try:
+                    publish(batch)
+                except BaseException as error:  # noqa: BLE001 - an internal error of one output
+                    scope.fail(error)
+        finally:
+            INNERMOST.scope = outer
 
     def send_event(self, event: Event) -> None:
         """Pass an event to the outputs."""
-        for name, publisher in self._ticked:
+        for running in self._ticked:
             # the failure of another output can end this output
-            if publisher.event is not None and self._running.get(name) is publisher:
-                try:
-                    publisher.event(event)
-                except Exception as error:  # noqa: BLE001 - an internal error of one output
-                    self._fail(name, error)
+            if not running.scope.is_closed:
+                running.scope.call(_send_event, running.publisher, event)
 
     def tick(self, now_ns: int) -> None:
         """Call `tick` of the outputs. Start failed outputs after their pause."""
-        has_failed = False
-        for name, publisher in self._ticked:
-            try:
-                # the failure of another output can end this output
-                if not has_failed or self._running.get(name) is publisher:
-                    publisher.tick(now_ns)
-            except Exception as error:  # noqa: BLE001 - an internal error of one output
-                has_failed = True
-                self._fail(name, error)
+        for publisher, scope, _ in self._ticked:
+            if not scope.is_closed:
+                scope.call(publisher.tick, now_ns)
         if self._failures:
             for name, failure in list(self._failures.items()):
                 if name not in self._running and now_ns >= failure.due_ns:
@@ -152,19 +164,12 @@ class Outputs:
 
     # --- failures ----------------------------------------------------------------------------------------------------
 
-    def take_error(self, error: BaseException) -> bool:
-        """Restart the output that caused an error in a callback of the event loop. Return False if none caused it."""
-        modules = set(modules_of(error))
-        for name, publisher in self._running.items():
-            if name not in self._extra and any(_belongs(module, type(publisher).__module__) for module in modules):
-                self._fail(name, error)
-                return True
-        return False
-
     def _fail(self, name: str, error: BaseException) -> None:
         """Close a failed output, and start it again after a pause."""
         if name in self._extra:
-            raise error
+            self._note_running()  # the output gets no more samples
+            self._context.owner.end_with(error)
+            return
         now_ns = self._context.clock.now_ns()
         before = self._failures.get(name)
         if before is not None and now_ns - before.due_ns > FORGOTTEN_NS:
@@ -182,22 +187,12 @@ class Outputs:
             self._end(name)
             self.send_event(Event(now_ns, "", EventKind.OUTPUT, f"{name}: {words}; imud starts this output again"))
 
-    def _guard(self, name: str, step: Callable[[Publisher], None]) -> None:
-        """Call a method of an output that may have ended. An exception restarts the output."""
-        publisher = self._running.get(name)
-        if publisher is None:
-            return
-        try:
-            step(publisher)
-        except Exception as error:  # noqa: BLE001 - an internal error of one output
-            self._fail(name, error)
-
     # --- start and end -----------------------------------------------------------------------------------------------
 
     def _start_or_fail(self, name: str) -> None:
         try:
             self._start(name)
-        except Exception as error:  # noqa: BLE001 - an internal error of one output
+        except BaseException as error:  # noqa: BLE001 - an internal error of one output
             self._fail(name, error)
         else:
             if name in self._running:
@@ -205,62 +200,80 @@ class Outputs:
 
     def _start(self, name: str) -> None:
         options = self._options[name]
-        self._context.outputs.failed.pop(name, None)
+        facts = self._context.outputs
+        facts.failed.pop(name, None)
+        facts.configured.discard(name)
         if PUBLISHERS[name].wanted(options):
-            self._run(name, PUBLISHERS[name].make(options, self._context))
+            facts.configured.add(name)
+            self._run(name, partial(PUBLISHERS[name].make, options, self._context))
 
-    def _run(self, name: str, publisher: Publisher) -> None:
+    def _run(self, name: str, make: Callable[[], Publisher]) -> None:
+        """Create and start an output in a scope of its own."""
+        scope = Scope(name, partial(self._fail, name))
+        publisher: Publisher | None = None
+        threads = set(threading.enumerate())
         try:
-            for device, device_id in self._devices.items():
-                publisher.add_device(device, device_id)
-            publisher.start()
-        except Exception:
-            self._close(name, publisher)  # the first exception is the reason
+            publisher = scope.run(make)
+            scope.run(self._start_publisher, publisher)
+            running = _Running(publisher, scope, publisher.publish)
+        except BaseException:
+            scope.close()
+            if publisher is not None:
+                self._close(name, publisher, scope)  # the first exception is the reason
             raise
-        self._running[name] = publisher
+        self._threads.add(scope, threads)
+        self._running[name] = running
         self._note_running()
+
+    def _start_publisher(self, publisher: Publisher) -> None:
+        for device, device_id in self._devices.items():
+            publisher.add_device(device, device_id)
+        publisher.start()
 
     def _end(self, name: str) -> BaseException | None:
         """End a running output. Return the exception that it raised."""
-        publisher = self._running.pop(name, None)
+        running = self._running.pop(name, None)
         self._note_running()
-        return self._close(name, publisher) if publisher is not None else None
+        if running is None:
+            return None
+        running.scope.close()
+        return self._close(name, running.publisher, running.scope)
 
     @staticmethod
-    def _close(name: str, publisher: Publisher) -> BaseException | None:
+    def _close(name: str, publisher: Publisher, scope: Scope) -> BaseException | None:
         """Close an output. Log and return the exception that it raised."""
         try:
-            publisher.close()
-        except Exception as error:
+            scope.run(publisher.close)
+        except BaseException as error:
             log.exception("%s: the end failed", name)
             return error
         return None
 
     def _note_running(self) -> None:
-        found = [(name, publisher.publish) for name, publisher in self._running.items()]
-        self._with_samples = tuple((name, publish) for name, publish in found if publish is not None)
-        self._ticked = tuple(self._running.items())
+        self._ticked = tuple(self._running.values())
+        self._with_samples = tuple(
+            (running.scope, running.publish)
+            for running in self._running.values()
+            if running.publish is not None and not running.scope.is_closed
+        )
+
+
+def _same(publisher: Publisher) -> Publisher:
+    """Return an output that exists: an output of the calling program."""
+    return publisher
+
+
+def _send_event(publisher: Publisher, event: Event) -> None:
+    send = publisher.event
+    if send is not None:
+        send(event)
 
 
 def _words(error: BaseException) -> str:
     """Return the reason of a failure for users."""
-    return str(error) if isinstance(error, ServerError) else f"internal error {type(error).__name__}: {error}"
+    return str(error) if isinstance(error, ServerError) else words_of(error)
 
 
 def _unexpected(error: BaseException) -> BaseException | None:
     """Return an exception whose traceback belongs into the log."""
     return None if isinstance(error, ServerError) else error
-
-
-def modules_of(error: BaseException) -> Iterator[str]:
-    """Yield the names of the modules whose functions an exception passed."""
-    trace = error.__traceback__
-    while trace is not None:
-        yield trace.tb_frame.f_globals.get("__name__", "")
-        trace = trace.tb_next
-
-
-def _belongs(module: str, output: str) -> bool:
-    """Return whether a module is the module of an output or in the package of the output."""
-    package = output.rpartition(".")[0]
-    return module == output or (package != __package__ and module.startswith(f"{package}."))

@@ -119,7 +119,7 @@ def test_exit_statuses_and_state_directory(tmp_path: Path, cli: Cli, monkeypatch
             os.write(writer, b"\n")
             logged = os.read(reader, 65536).decode()
         assert said in printed + logged
-        settings, file = serve.call_args.args
+        settings, file, _ = serve.call_args.args
         assert (settings.state_dir, file) == (str(tmp_path), tmp_path / "imud.yaml")
     settings = config.parse("state_dir: /srv/imud\ndevices: {}\n", "imud.yaml")
     monkeypatch.delenv("STATE_DIRECTORY", raising=False)

@@ -18,7 +18,8 @@ from imud.contracts.codec import Poll, Reading
 from imud.contracts.script import Transfer, TransferScript
 from imud.contracts.status import KernelCounters
 from imud.daemon import Daemon
-from imud.device.polled_bus import BusMember, Deadlines, PolledBuses, ReadySchedule, RoundRobin, Schedule
+from imud.device.polled_bus import BusMember, PolledBuses
+from imud.device.timetable import Deadlines, ReadySchedule, RoundRobin, Schedule
 from imud.host.clock import HostClock
 from imud.model.errors import DeviceRefused, LinkError, TransferError, Trouble
 from imud.model.units import NS_PER_S

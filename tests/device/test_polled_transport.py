@@ -22,8 +22,8 @@ from imud.contracts.codec import Poll, Reading
 from imud.contracts.lines import DeviceLines, LineFactory, OnEdges, OnLineEnd, ReadyOptions
 from imud.contracts.status import DeviceState
 from imud.device.latency import Need
-from imud.device.polled_bus import Deadlines, ReadySchedule
 from imud.device.polled_transport import DataReady
+from imud.device.timetable import Deadlines, ReadySchedule
 from imud.drivers.imu61x import spi as codec
 from imud.drivers.imu61x.spi import READ_STATE
 from imud.host.clock import HostClock

@@ -10,6 +10,7 @@ import msgspec
 import pytest
 
 from imud.contracts.publisher import Batch, Publisher, PublisherType
+from imud.host.scope import ThreadScopes
 from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
 from imud.model.options import Options
@@ -120,12 +121,12 @@ class Rig:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, modules: dict[str, str]) -> None:
         self.did: list[tuple[object, ...]] = []
-        self.failing: dict[tuple[str, str], Exception] = {}
+        self.failing: dict[tuple[str, str], BaseException] = {}
         self.clock = VirtualClock()
         rows = {name: self._row(name, at) for name, at in modules.items()}
         monkeypatch.setattr(module, "PUBLISHERS", rows)
         self.context = publisher_context(now_ns=self.clock.now_ns)
-        self.outputs = Outputs(self.context, {})
+        self.outputs = Outputs(self.context, {}, ThreadScopes())
         self.options = dict.fromkeys(rows, Switch())
 
     def _row(self, name: str, module_name: str) -> PublisherType:
@@ -263,42 +264,11 @@ def test_the_end_closes_all_outputs_and_returns_the_first_error(rig: Rig, method
     assert rig.done("tick", "close") == [(name, step) for name in ("one", "two", "must") for step in ("tick", "close")]
 
 
-def error_through(*modules: str) -> Exception:
-    """Return an exception that passed a function of each module, outermost first."""
-    call: Callable[[], object] = [].__iter__().__next__
-    for name in reversed(modules):
-        names: dict[str, Any] = {"__name__": name, "inner": call}
-        exec("def call(): inner()", names)
-        call = names["call"]
-    try:
-        call()
-    except StopIteration as error:
-        return error
-    raise AssertionError
-
-
-@pytest.mark.parametrize(
-    ("modules", "taken"),
-    [
-        (("asyncio.events", "imud.fleet.broker"), "mqtt"),
-        (("asyncio.events", "imud.publishers.nmea0183", "imud.formats.nmea0183"), "nmea0183"),
-        (("asyncio.events", "imud.publishers.socket.client"), "socket"),
-        (("asyncio.events", "imud.device.transport"), None),
-    ],
-)
-def test_an_error_in_a_callback_restarts_the_output_whose_code_it_passed(
-    monkeypatch: pytest.MonkeyPatch, modules: tuple[str, ...], taken: str | None
-) -> None:
-    names = "publishers.nmea0183", "publishers.socket.server", "fleet.publisher"
-    rig = Rig(monkeypatch, {name: f"imud.{at}" for name, at in zip(("nmea0183", "socket", "mqtt"), names, strict=True)})
-    rig.start()
-    assert rig.outputs.take_error(error_through(*modules)) == (taken is not None)
-    assert rig.done("close") == ([(taken, "close")] if taken else [])
-
-
 def test_an_exception_in_an_output_of_the_program_reaches_the_program(rig: Rig) -> None:
     asked = Mock()
-    outputs = Outputs(publisher_context(latencies=asked), {"mine": cast("Publisher", FakeOutput(rig, "mine"))})
+    outputs = Outputs(
+        publisher_context(latencies=asked), {"mine": cast("Publisher", FakeOutput(rig, "mine"))}, ThreadScopes()
+    )
     outputs.start({})
     assert asked.mock_calls == [call.ask("mine", 0)]
     rig.failing[("mine", "publish")] = ValueError("mine")

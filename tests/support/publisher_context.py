@@ -83,6 +83,9 @@ class FakeOwner:
 
     def tick_soon(self) -> None: ...
 
+    def end_with(self, error: BaseException) -> None:
+        raise error
+
 
 def publisher_context(
     status: Callable[[], Sequence[DeviceStatus]] = list, epoch: int = 1, now_ns: Callable[[], int] = lambda: 0,

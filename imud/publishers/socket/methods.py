@@ -233,7 +233,7 @@ def _status(hub: Hub, connection: ClientConnection, _params: NoParams) -> Pieces
     result = {
         "now_ns": str(now_ns) if texts else now_ns, "devices": made, "socket": socket,
         "configuration": hub.context.configuration, "mqtt": [status() for status in hub.context.outputs.mqtts],
-        "outputs": hub.context.outputs.problems(),
+        "outputs": hub.context.outputs.problems(), "output_states": hub.context.outputs.states(),
         "c_kernel": CKernelStatus(kernel.present.module is not None, kernel.present.problem),
     }  # fmt: skip
     return MethodReply(result, big_numbers=False)
