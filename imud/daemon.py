@@ -42,6 +42,7 @@ from imud.device.latency import LatencyBudget
 from imud.host.clock import HostClock
 from imud.host.event_loop import Alarm
 from imud.host.log import printable
+from imud.host.process_watch import ProcessWatch
 from imud.host.scope import Scope, ThreadScopes, words_of
 from imud.host.service_manager import ServiceManager, notify
 from imud.lines.driven_line import driving
@@ -225,6 +226,7 @@ class Daemon:
         self._manager = ServiceManager()
         self._conditions: list[str] | None = None  # names and conditions of the devices at the last status line
         self._summary_line = ""
+        self._watch = ProcessWatch(host.now_ns, self)
         self._signals: list[int] = []  # signals with a handler of this daemon
 
     # --- life ------------------------------------------------------------------------------------------------------
@@ -238,6 +240,7 @@ class Daemon:
         loop.set_exception_handler(self._on_loop_error)
         loop.set_default_executor(_one_thread())
         self._threads.install(loop)
+        self._watch.start(loop)
         if self._file is not None:
             self._reloader = Reloader(self._file, self, self._host)
         try:
@@ -255,6 +258,7 @@ class Daemon:
             on_stopping(self._failure)
             await self._close()
             self._threads.remove()
+            self._watch.close()
             self._ignore_signals()
             log.info("imud has stopped")
         if self._failure is not None:
@@ -483,6 +487,7 @@ class Daemon:
         """Call `tick` of all outputs. Call `tick` of all devices once per second, and after `tick_soon`."""
         assert self._alarm is not None
         now_ns = self._host.now_ns()
+        self._watch.tick(now_ns)
         if self._is_soon or now_ns >= self._devices_due_ns:
             self._is_soon, self._devices_due_ns = False, now_ns + DEVICES_NS
             self._host.utc_offset_ns()  # without samples too: the rate of the clock is a mean between two reads
@@ -493,6 +498,24 @@ class Daemon:
         self._outputs.tick(now_ns)
         self._manager.tick(now_ns, self._status_line)
         self._alarm.set(TICK_S if self._is_soon else QUIET_TICK_S)
+
+    def on_blocked(self, scope: Scope | None, duration_ns: int) -> None:
+        """Report code that blocked the event loop: log, event and status of its device."""
+        name = scope.owner if scope is not None else "an unknown part"
+        if scope is not None and self._scopes.get(name) is scope:
+            scope.call(self._devices[name].report_blocked, duration_ns)
+            return
+        words = f"{name} blocked imud for {duration_ns / NS_PER_S:.1f} s"
+        log.error("%s", words)
+        self.send_event(Event(self._host.now_ns(), "", EventKind.OUTPUT, words))
+
+    def on_growth(self, text: str) -> None:
+        """Report the growth of the process. The devices of other packages show it in their status."""
+        log.warning("%s", text)
+        self.send_event(Event(self._host.now_ns(), "", EventKind.CONFIGURATION, text))
+        for name, device in list(self._devices.items()):
+            if device.is_of_other_package:
+                self._scopes[name].call(device.report_memory, text)
 
     def _status_line(self) -> str:
         conditions = [*self._devices, *map(CONDITION, self._devices.values())]

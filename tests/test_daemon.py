@@ -307,6 +307,70 @@ async def test_a_reload_starts_and_stops_devices(tmp_path: Path, monkeypatch: py
     await Daemon(config_of(tmp_path, bow={}), until_finished=True).run()
 
 
+@in_loop
+async def test_a_failed_device_of_imud_starts_again_after_a_pause(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """An internal error in one device ended the daemon with all devices."""
+    run = AsyncMock(side_effect=SystemExit(0))
+    monkeypatch.setattr(Device, "run", run)
+    daemon = Daemon(config_of(tmp_path, bow={}))
+    running = asyncio.create_task(daemon.run())
+    for pause_s in (1, 2, 4):
+        for _ in range(9):
+            await asyncio.sleep(0)
+        (status,) = daemon.status()
+        assert (status.state, status.word) == ("failed", "missing")
+        assert status.problem == f"internal error SystemExit: 0; imud starts this device again in {pause_s} s"
+        due_ns = daemon._restarts["bow"].due_ns
+        daemon._restart_devices(due_ns - 1)
+        assert daemon.status()[0].state == "failed"
+        daemon._restart_devices(due_ns)
+        assert daemon.status()[0].state == "missing"
+    assert run.call_count == 4
+    assert "bow: internal error SystemExit: 0; imud continues without this device" in caplog.text
+    daemon.stop()
+    await running
+
+
+@in_loop
+async def test_a_status_that_fails_ends_only_its_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    daemon = Daemon(config_of(tmp_path, bow={}, stern={}))
+    running = asyncio.create_task(daemon.run())
+    for _ in range(9):
+        await asyncio.sleep(0)
+    device = daemon._devices["bow"]
+    good = device.status
+    monkeypatch.setattr(device, "status", Mock(side_effect=[KeyboardInterrupt(), good(), good()]))
+    assert [status.name for status in daemon.status()] == ["bow", "stern"]
+    assert [status.state for status in (good(), daemon.status()[1])] == ["failed", "missing"]
+    daemon.stop()
+    await running
+
+
+@in_loop
+async def test_a_block_and_a_growth_are_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    daemon = Daemon(config_of(tmp_path, bow={}))
+    running = asyncio.create_task(daemon.run())
+    for _ in range(9):
+        await asyncio.sleep(0)
+    bow = daemon._devices["bow"]
+    daemon.on_blocked(daemon._scopes["bow"], 8 * NS_PER_S)
+    blocked = "the driver hipnuc-uart of the device bow blocked imud for 8.0 s; all devices lost samples or time"
+    assert daemon.status()[0].problem == blocked
+    bow.tick(monotonic_ns() + 601 * NS_PER_S)
+    assert daemon.status()[0].problem == ""
+    daemon.on_blocked(None, 3 * NS_PER_S)
+    monkeypatch.setattr(Device, "is_of_other_package", True)
+    daemon.on_growth("imud uses 500 MiB of memory, 100 MiB after its start")
+    leak = "imud uses 500 MiB of memory, 100 MiB after its start; the driver hipnuc-uart of another package may leak"
+    assert daemon.status()[0].problem == leak
+    messages = [event.message for event in daemon._context.past_events.newest(0, 99).events]
+    assert {blocked, leak, "an unknown part blocked imud for 3.0 s"} <= set(messages)
+    daemon.stop()
+    await running
+
+
 def reload(daemon: RunningDaemon, devices: dict[str, Any], **more: Any) -> None:
     """Write another configuration and reload the daemon."""
     write_config(daemon.folder, devices, **more)

@@ -144,41 +144,67 @@ def test_a_package_with_a_problem_stops_nothing(tmp_path: Path, monkeypatch: pyt
 
 
 FAILING = """
+import os, threading
 from dataclasses import replace
 from imud.drivers import DRIVERS
 from imud.drivers.imu61x.uart.codec import Imu61xCodec
 
 class Codec(Imu61xCodec):
     def feed(self, data):
-        raise OverflowError("too large")
+        threading.Thread(target=threading.Event().wait, name="never ends").start()
+        raise ERROR
+
+    def reset(self):
+        raise ERROR
 
 ROW = replace(DRIVERS["imu61x-uart"], name="failing", interface=1, make_codec=Codec)
 """
 
 
-def test_a_driver_that_raises_ends_only_its_devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", ["OverflowError('too large')", "SystemExit(0)"])
+def test_a_driver_that_raises_ends_only_its_devices(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: str
+) -> None:
+    """SystemExit(0) ended the daemon with status 0, and a failing `reset` ended all devices."""
     points = {"imud.drivers": {"failing": "failing_example:ROW"}}
-    write_package(tmp_path / "site", "failing-example", points, {"failing_example.py": FAILING})
+    files = {"failing_example.py": FAILING.replace("ERROR", error)}
+    write_package(tmp_path / "site", "failing-example", points, files)
     use(tmp_path / "site", monkeypatch)
-    (tmp_path / "capture.bin").write_bytes(bytes(100))
+    capture = tmp_path / "capture.bin"
+    capture.write_bytes(bytes(100))
+    name = error.partition("(")[0]
+    words_of_driver = f"the driver failing of another package failed: internal error {name}: "
+    assert words_of_driver in imud("decode", "--driver", "failing", capture, status=1)
     devices = {
-        "bow": {"driver": "failing", "replay": {"path": str(tmp_path / "capture.bin"), "speed": "maximum"}},
+        "bow": {"driver": "failing", "replay": {"path": str(capture), "speed": "maximum"}},
         "mast": {"uart": {"port": str(tmp_path / "port")}},
     }
     file = tmp_path / "imud.yaml"
     with simulator(tmp_path, [("hipnuc-uart", 0)], 100.0, ""):
+        assert "hipnuc-uart at 115200 baud" in imud("probe", tmp_path / "port")
         write_config(tmp_path, devices)
         words = [sys.executable, "-m", "imud", "run", "--config", str(file)]
         with (tmp_path / "log").open("w") as log, subprocess.Popen(words, stderr=log) as process:
             try:
                 wait_until(lambda: "mast: hipnuc-uart on" in (tmp_path / "log").read_text(), "mast")
                 with Client(tmp_path / "imud.sock") as client:
-                    assert [one["name"] for one in client.status()["devices"]] == ["mast"]
+                    status = client.status()
+                states = {device["name"]: (device["state"], device["problem"]) for device in status["devices"]}
+                assert states["mast"] == ("running", "")
+                assert states["bow"][0] == "failed"
+                assert states["bow"][1].startswith(words_of_driver)
+                assert [(one["name"], one["running"]) for one in status["output_states"]] == [
+                    ("metrics", True), ("shm", True), ("socket", True),
+                ]  # fmt: skip
                 events = imud("events", "--socket", tmp_path / "imud.sock", "--since", "10min")
-                assert "imud does not use bow and the driver failing until its next start" in " ".join(events.split())
+                assert words_of_driver in " ".join(events.split())
+                shown = " ".join(imud("status", "--socket", tmp_path / "imud.sock", status=1).split())
+                assert f"bow: missing T{words_of_driver[1:]}" in shown
             finally:
                 process.terminate()
             assert process.wait(60) == 0
     text = (tmp_path / "log").read_text()
-    assert "failing: internal error OverflowError: too large; imud stops its devices and continues" in text
+    assert f"bow: {words_of_driver}" in text
+    assert "imud continues without this device" in text
     assert "Traceback" in text
+    assert "still running: never ends" in text

@@ -63,6 +63,7 @@ if the device node exists but imud cannot open it."""
 IDLE_FLUSH_NS = 50 * NS_PER_MS
 """Idle time of the link after which the codec discards a pending frame, ns. Latency timers take up to 16 ms."""
 SILENCE_NS = 1 * NS_PER_S  # minimum time without a sample that makes a device silent, ns
+BLOCKED_SHOWN_NS: Final = 600 * NS_PER_S  # time for which the status shows that a driver blocked imud, ns
 WATCHED: Final = (DeviceState.SEARCHING, DeviceState.SILENT)  # states that end with the first sample
 SILENCE_PERIODS = 5  # minimum number of sample periods without a sample that makes a device silent
 
@@ -113,6 +114,8 @@ class Device:
         self._is_slow = True  # whether the sample period is longer than IDLE_FLUSH_NS, or not known
         self._is_quick = False  # whether a tick can end immediately while samples arrive and no command runs
         self._connects = 0
+        self._shown_problem = ""  # problem of `_show_problem`
+        self._shown_until_ns = 0  # CLOCK_MONOTONIC of its end
         self._has_failed = False  # whether an internal error has ended the device
         self._need = Need(0, "")
         self._ended: asyncio.Future[LinkError | None] | None = None
@@ -155,6 +158,9 @@ class Device:
             if now_ns >= judge.due_ns:
                 self._judge_condition(now_ns)
             return
+        if self._shown_problem and now_ns >= self._shown_until_ns:
+            health.clear_link_problem(self._shown_problem)
+            self._shown_problem = ""
         has_news = path is None or now_ns - path.last_sample_ns > IDLE_FLUSH_NS or health.state is not RUNNING
         is_due = now_ns >= judge.due_ns
         is_quick = self._is_quick and not (has_news or transport.busy or self.settings.lock.work is not None)
@@ -233,8 +239,24 @@ class Device:
         driver = self._transport.driver or DRIVERS.get(self.config.driver)
         return driver is not None and driver.interface != 0
 
+    def report_blocked(self, duration_ns: int) -> None:
+        """Report that the code of the device blocked imud. The problem stays in the status for BLOCKED_SHOWN_NS."""
+        now_ns = self._host.now_ns()
+        who = f"the driver {self.driver_name} of the device {self.config.name}"
+        words = f"{who} blocked imud for {duration_ns / NS_PER_S:.1f} s"
+        self._show_problem(now_ns, f"{words}; all devices lost samples or time")
+
+    def report_memory(self, words: str) -> None:
+        """Report that the process grows. The driver of another package can be the cause."""
+        self._show_problem(self._host.now_ns(), f"{words}; the driver {self.driver_name} of another package may leak")
+
+    def _show_problem(self, now_ns: int, problem: str) -> None:
+        self._health.on_link_news(now_ns, problem, problem)
+        self._shown_problem = problem
+        self._shown_until_ns = now_ns + BLOCKED_SHOWN_NS
+
     def fail(self, problem: str) -> None:
-        """End the device after an internal error. Its status shows `problem`. imud calls its driver no more."""
+        """End the device after an internal error. Its status shows `problem`. imud does not call its driver again."""
         now_ns = self._host.now_ns()
         was_streaming = self._health.streaming
         self._has_failed = True

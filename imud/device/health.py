@@ -175,6 +175,13 @@ class Health:
             log.warning("%s: %s", self._events.device, problem, extra=same_as(problem))
         self.problem = problem
 
+    def clear_link_problem(self, problem: str) -> None:
+        """Show a problem of `on_link_news` no longer, unless another problem has replaced it."""
+        if self.link_problem == problem:
+            self.link_problem = ""
+        if self.problem == problem:
+            self.problem = ""
+
     def on_link_news(self, now_ns: int, news: str, problem: str) -> None:
         """Raise an event about a change of the link. `problem` is the problem after the change."""
         self.link_problem = self.problem = printable(problem, MESSAGE_CHARACTERS_MAX)

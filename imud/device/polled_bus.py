@@ -355,7 +355,7 @@ class PolledBus:
         self._polling.remove(polling)
         try:
             polling.link.close()
-        except Exception as error:  # noqa: BLE001 - the other members of the bus continue
+        except BaseException as error:  # noqa: BLE001 - the other members of the bus continue
             log.error("%s: cannot close its link: %s", polling.link.title, words_of(error))
 
     def do_round(self) -> int:

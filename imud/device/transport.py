@@ -167,7 +167,7 @@ class Transport(SettingsPort):
         self.stop()
 
     def forget_driver(self) -> None:
-        """Use the driver no more: its code has failed."""
+        """Forget the driver, because its code has failed."""
         self.driver = self.path = None
 
     # --- requests ----------------------------------------------------------------------------------------------------

@@ -232,7 +232,7 @@ class _GuardedCodec:
         return event  # type: ignore[no-any-return]
 
     def _end(self) -> None:
-        """Call the codec no more, and repair the ledger: all outputs read it."""
+        """Do not call the codec again, and repair the ledger: all outputs read it."""
         self.has_failed = True
         ledger = self.ledger
         for name in LEDGER_FIELDS:

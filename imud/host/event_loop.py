@@ -286,8 +286,12 @@ class SampleLoop(asyncio.SelectorEventLoop):
         """Return the scope of the running code; None if it belongs to no scope."""
         return INNERMOST.scope or self._reader_selector.running_scope() or INHERITED.get()
 
+    def running_reader_scope(self) -> Scope | None:
+        """Return the scope of the running reader or alarm; None if none is running. Any thread may call it."""
+        return self._reader_selector.running_scope()
+
     def _context(self) -> Context | None:
-        """Return the context of the innermost scope; None if this scope is that of the present context."""
+        """Return the context of the innermost scope; None if the present context already has this scope."""
         scope = INNERMOST.scope or self._reader_selector.running_scope()
         return None if scope is None else scope.context
 

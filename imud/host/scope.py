@@ -17,7 +17,7 @@ from asyncio.events import Handle
 from collections.abc import Callable, Collection, Coroutine, Mapping
 from contextlib import suppress
 from contextvars import Context, ContextVar, copy_context
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import Any, Final, TypeVar, TypeVarTuple
 from weakref import WeakKeyDictionary
 
@@ -92,7 +92,7 @@ class Scope:
             INNERMOST.scope = outer
 
     def task(self, body: Coroutine[Any, Any, None], name: str) -> asyncio.Task[None]:
-        """Start a task. Its exception is a failure. Its cancellation is a failure if nobody cancelled the task."""
+        """Start a task. Its exception is a failure. Its cancellation is a failure without a call of `cancel`."""
         task = asyncio.get_running_loop().create_task(body, name=name, context=self.context.copy())
         task.add_done_callback(self._on_done, context=self.context)
         return task
@@ -187,6 +187,15 @@ def scope_of_traceback(trace: TracebackType | None) -> Scope | None:
         if trace.tb_frame.f_code is Handle._run.__code__:
             return _scope_of_handle(trace.tb_frame.f_locals["self"])
         trace = trace.tb_next
+    return None
+
+
+def scope_of_frame(frame: FrameType | None) -> Scope | None:
+    """Return the scope of the callback that a frame and its callers belong to. Any thread may call it."""
+    while frame is not None:
+        if frame.f_code is Handle._run.__code__:
+            return _scope_of_handle(frame.f_locals["self"])
+        frame = frame.f_back
     return None
 
 

@@ -56,7 +56,7 @@ def test_json_is_all_that_the_socket_sends(tmp_path: Path, cli: Cli) -> None:
             said = client.status()
         shown = json.loads(cli("status", "--socket", served.path, "--json").out)
         assert said["c_kernel"] == {"active": kernel.present.module is not None, "problem": kernel.present.problem}
-        members = {"now_ns", "devices", "socket", "configuration", "mqtt", "outputs", "c_kernel"}
+        members = {"now_ns", "devices", "socket", "configuration", "mqtt", "outputs", "output_states", "c_kernel"}
         assert shown.keys() == said.keys() == members
         assert shown["devices"] == said["devices"]
         one = json.loads(cli("status", "--socket", served.path, "--json", "imu1").out)

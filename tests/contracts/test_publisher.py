@@ -8,7 +8,7 @@ from imud.attitude.conventions import RFU_ENU, Convention
 from imud.attitude.published import published_frame
 from imud.contracts import publisher
 from imud.contracts.publisher import Batch, OutputFacts, SlotBatch
-from imud.contracts.status import OutputStatus
+from imud.contracts.status import OutputState, OutputStatus
 from imud.formats.slot import encode_slot
 from imud.publishers import PUBLISHERS
 from tests.support.rings import DEVICE, make_sample
@@ -50,3 +50,15 @@ def test_problems_of_outputs_and_of_their_ports() -> None:
     facts = OutputFacts(failed={"mqtt": "no broker"}, ports={"nmea0183": lambda: ports})
     assert facts.problems() == {"mqtt": "no broker", "nmea0183 tcp a": "busy"}
     assert PUBLISHERS["socket"].claims(None) == ()
+
+
+def test_each_configured_output_has_a_state() -> None:
+    """The status contained only outputs with a problem, so a configured output could be invisible."""
+    ports = [OutputStatus("tcp a", 0, 0, 0, "busy"), OutputStatus("tcp b", 0, 0, 0, "no reader")]
+    facts = OutputFacts(failed={"mqtt": "no broker"}, ports={"nmea0183": lambda: ports})
+    facts.configured.update({"shm", "nmea0183", "mqtt"})
+    assert facts.states() == [
+        OutputState("mqtt", False, "no broker"),
+        OutputState("nmea0183", True, "busy; no reader"),
+        OutputState("shm", True),
+    ]  # fmt: skip

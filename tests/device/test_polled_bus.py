@@ -21,7 +21,8 @@ from imud.daemon import Daemon
 from imud.device.polled_bus import BusMember, PolledBuses
 from imud.device.timetable import Deadlines, ReadySchedule, RoundRobin, Schedule
 from imud.host.clock import HostClock
-from imud.model.errors import DeviceRefused, LinkError, TransferError, Trouble
+from imud.host.scope import INHERITED, Scope
+from imud.model.errors import CommandError, DeviceRefused, LinkError, TransferError, Trouble
 from imud.model.units import NS_PER_S
 from imud.sim.imu61x.registers import Imu61xRegisters
 from tests.support.event_loops import VirtualClock, in_loop, run_virtually, virtual_buses
@@ -383,18 +384,47 @@ async def test_daemon_serves_a_polled_device(bench: PolledBusBench) -> None:
     assert not bench.spi.opened
 
 
-@pytest.mark.live
-def test_an_internal_error_in_the_bus_thread_ends_the_daemon(bench: PolledBusBench) -> None:
-    def mistake(_selections: Any, _mode: int) -> list[bytes]:
-        raise ZeroDivisionError("a mistake")
+FAILURES = [ZeroDivisionError("a mistake"), SystemExit(0), KeyboardInterrupt(), MemoryError(), GeneratorExit()]
 
-    bench.spi.device = mistake
 
-    async def body() -> None:
-        await asyncio.wait_for(Daemon(Config("info", "", {}, (bench.on_spi(),))).run(), 60)
+@pytest.mark.parametrize("error", FAILURES, ids=lambda error: type(error).__name__)
+@pytest.mark.parametrize("place", ["transfer", "readings", "command", "close"])
+@played(BusBench)
+async def test_an_internal_error_of_one_device_leaves_the_bus(it: BusBench, place: str, error: BaseException) -> None:
+    """An internal error in the thread of a bus ended the daemon."""
 
-    with pytest.raises(ZeroDivisionError, match="a mistake"):
-        asyncio.run(body())
+    def fail(*_: object) -> None:
+        raise error
+
+    failures: list[BaseException] = []
+    wire, sink = Wire(), Sink()
+    INHERITED.set(Scope("ex", failures.append))
+    bad = it.buses.get("wire").join(wire, Deadlines(), fail if place == "readings" else sink.on_readings)
+    if place == "transfer":
+        wire.takes_time = fail
+    if place == "command":
+        bad.command(fail)
+    if place == "close":
+        wire.close = fail  # type: ignore[method-assign]
+        bad.leave()
+    bad.start([Poll(ASK)])
+    it.member.start([Poll(ASK)])
+    await it.sink.enough.wait()
+    assert failures == ([] if place == "close" else [error])
+    wire.close = lambda: None  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize("error", FAILURES, ids=lambda error: type(error).__name__)
+@played(BusBench)
+async def test_an_internal_error_of_a_script_ends_the_script(it: BusBench, error: BaseException) -> None:
+    def script() -> TransferScript[None]:
+        yield ASK
+        raise error
+
+    with pytest.raises(CommandError, match=f"the script failed: internal error {type(error).__name__}"):
+        await it.member.run(script(), 1)
+    it.member.start([Poll(ASK)])
+    await it.sink.enough.wait()
 
 
 QUIET_NS = 500 * 10**6

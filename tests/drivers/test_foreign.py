@@ -113,7 +113,8 @@ def test_failed_codec_is_called_no_more(number: int) -> None:
 
 
 EVENTS: list[Any] = [
-    [GOOD], (GOOD,), [TextLine("OK")], [ReplyFrame(1, b"x")], [BadFrame(BadReason.CRC, b"x")], [Vanished("no reply")], [],
+    [GOOD], (GOOD,), [TextLine("OK")], [ReplyFrame(1, b"x")], [BadFrame(BadReason.CRC, b"x")], [Vanished("no reply")],
+    [],
 ]  # fmt: skip
 WRONG_EVENTS: list[Any] = [
     None, "text", 5, {GOOD: 1}, iter([GOOD]), [None], [object()], [TextLine(5)], [ReplyFrame("1", b"x")],  # type: ignore[arg-type]

@@ -81,7 +81,7 @@ def _from_reader(rig: Rig) -> None:
 
 
 async def _by_library(rig: Rig) -> None:
-    """Make a task in a task, as libraries do. Nobody waits for it."""
+    """Schedule a callback in a task, as libraries do."""
     await asyncio.sleep(0)
     rig.scope.context.run(asyncio.sleep, 0).close()
     rig.loop.call_soon(rig.fail)

@@ -214,6 +214,11 @@ def test_an_output_that_cannot_start_tries_again(rig: Rig, caplog: pytest.LogCap
     rig.failing[("two", "start")] = error
     rig.start()
     assert (rig.outputs.summary(), list(rig.context.outputs.problems())) == ("one, must (not yet: two)", ["two"])
+    assert {state.name: state.running for state in rig.context.outputs.states()} == {
+        "must": True,
+        "one": True,
+        "two": False,
+    }
     assert str(error) in rig.context.outputs.problems()["two"]
     assert ("Traceback" in caplog.text) == isinstance(error, OSError)
     caplog.clear()
