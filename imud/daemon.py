@@ -36,9 +36,10 @@ from imud.contracts.publisher import (
     PublisherContext,
 )
 from imud.contracts.status import DeviceState, DeviceStatus
-from imud.device.device import Device, RecordableDevices
+from imud.device.device import Device
 from imud.device.factory import DeviceFactory
 from imud.device.latency import LatencyBudget
+from imud.device.recordable import RecordableDevices
 from imud.host.clock import HostClock
 from imud.host.event_loop import Alarm
 from imud.host.log import printable

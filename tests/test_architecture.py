@@ -488,6 +488,7 @@ TESTED_IN = {
     "imud.cli.schema": "cli/test_main.py", "imud.cli.setup.changes": "cli/setup/test_steps.py",
     "imud.cli.sim": "sim/test_main.py", "imud.sampling.driver_clock": "sampling/test_path.py",
     "imud.config.model": "config/test_reading.py", "imud.publishers.rules.settings": "publishers/rules/test_limit.py",
+    "imud.device.recordable": "device/test_can_transport.py",
     "imud.config.parts": "config/test_reading_signals.py",
     "imud.config.schema": "config/test_reading.py", "imud.device.device": "device/test_can_transport.py",
     "imud.device.factory": "device/test_search.py", "imud.device.transport": "device/test_stream_transport.py",

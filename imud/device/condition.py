@@ -1,4 +1,4 @@
-"""Condition of one device: reasons from a few facts, with hysteresis, and counts of the last minute.
+"""Condition of one device: reasons from a few facts, with hysteresis.
 
 Facts ──▶ causes_of (RULES) ──▶ ConditionWatch (begins after 5 s, ends after 60 s) ──▶ event
                                       └──▶ sentences, if the condition changes or a client requests them
@@ -28,12 +28,11 @@ from imud.contracts.condition import (
 from imud.contracts.setting import SettingDifference, SettingsState, SettingsStatus, title_of, value_text
 from imud.contracts.status import DeviceState, FrameProblem, LinesStatus, RecentStatus
 from imud.device.health import NO_SAMPLE, RUNNING, SEARCH_BEGUN, DeviceEvents
+from imud.device.recent_counts import MINUTE_NS, RATE_WINDOW_NS, RecentCounts
 from imud.links.serial_port import list_ports
 from imud.model.event import EventKind
-from imud.model.ledger import LOST_FIELDS, Ledger
+from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_MS, NS_PER_S
-
-MINUTE_NS: Final = 60 * NS_PER_S
 
 # Reasons that end immediately with their cause. Only the user or a new start of the samples ends these causes, so that
 # the reasons do not flicker.
@@ -242,9 +241,6 @@ def _lost(facts: Facts, _name: str, _value: Any) -> str:
     return f"{percent:.{1 if percent >= 1 else 2}f} % of the samples are lost {facts.cause.present}."
 
 
-RATE_WINDOW_NS: Final = 10 * NS_PER_S  # time over which imud measures the rate, ns
-RATE_SECONDS: Final = RATE_WINDOW_NS // NS_PER_S + 1  # number of counts in this time
-SHORT_NS: Final = 2 * NS_PER_S  # time of the rate in the status, ns: two samples of a device at 1 Hz
 RATE_SAMPLES: Final = 2  # deviation that the start and the end of the window can cause, samples
 DEVIATION_HZ: Final = RATE_SAMPLES * NS_PER_S / RATE_WINDOW_NS  # the same deviation of the rate
 
@@ -351,104 +347,9 @@ RULES: Final = (
     Rule(ReasonCode.LOST_BEFORE, Section.LEDGER, lambda f, _: f.recent.loss_ns > 0, _lost_before),
     Rule(
         ReasonCode.NONE_LOST, Section.LEDGER, lambda f, _: not f.recent.loss_ns,
-        lambda f, *_: f"No sample was lost since imud started {f.ago(f.recent.begun_ns)}.",
+        lambda f, *_: f"No sample was lost since imud started to read this device {f.ago(f.recent.begun_ns)}.",
     ),
 )  # fmt: skip
-
-
-# --- counts of the last minute ----------------------------------------------------------------------------------------
-
-CAUSES: Final = tuple(name.removeprefix("lost_") for name in LOST_FIELDS)
-HOUR_NS: Final = 60 * MINUTE_NS
-STEADY: Final = 0.01  # maximum change of the expected rate within the window of a rate, as a share
-RESTARTS_MAX: Final = 60  # maximum number of stored restarts, as in `ConditionLimits.restarts`
-_Lost = tuple[int, ...]  # in the order of CAUSES
-_Second = tuple[int, int, int, _Lost]  # CLOCK_MONOTONIC, ns, and the counters `samples`, `bytes_in` and of lost samples
-
-
-def _by_cause(before: _Lost, after: _Lost) -> dict[str, int]:
-    """Return the numbers of samples lost between two counts, without causes with no loss."""
-    return {name: now - then for name, then, now in zip(CAUSES, before, after, strict=True) if now > then}
-
-
-class RecentCounts:
-    """Counts of a device in the last minute and restarts in the last hour. Synchronization: the loop's thread only."""
-
-    def __init__(self, ledger: Ledger, begun_ns: int, *, timed: bool) -> None:
-        """`timed`: the device sends in real time. A replay can be faster, so its rate is not known."""
-        self._ledger = ledger
-        self._begun_ns = begun_ns
-        self._timed = timed
-        self._seconds: deque[_Second] = deque([(begun_ns, ledger.samples, ledger.bytes_in, ledger.losses())], maxlen=64)
-        # CLOCK_MONOTONIC since which the expected rate is the same, without a gap of unknown size
-        self._steady_ns = begun_ns
-        self._steady_hz = 0.0  # expected rate at this time; 0.0 while the rate is not known
-        self._restarts: deque[int] = deque(maxlen=RESTARTS_MAX)
-        self._resets = 0
-        self._loss: dict[str, int] = {}  # number of samples in the last loss by cause
-        self._loss_ns = 0
-
-    def add(self, now_ns: int, rate_hz: float, resets: int) -> bool:
-        """Add the present counts. Return whether samples were lost in the last minute. `rate_hz`: expected rate, 0 if
-        the device does not run; `resets`: own restarts."""
-        ledger, seconds = self._ledger, self._seconds
-        lost, before = ledger.losses(), seconds[-1][3]
-        if lost != before:
-            self._add_loss(now_ns, _by_cause(before, lost))
-        seconds.append((now_ns, ledger.samples, ledger.bytes_in, lost))
-        begin_ns = now_ns - MINUTE_NS
-        while seconds[1][0] <= begin_ns:  # one count remains before the minute
-            seconds.popleft()
-        if abs(rate_hz - self._steady_hz) > STEADY * self._steady_hz:
-            self._steady_ns, self._steady_hz = now_ns, rate_hz
-        if resets != self._resets or self._restarts:
-            self._restarts.extend([now_ns] * min(max(resets - self._resets, 0), RESTARTS_MAX))
-            self._resets = resets
-            while self._restarts and self._restarts[0] <= now_ns - HOUR_NS:
-                self._restarts.popleft()
-        return seconds[0][3] != lost
-
-    def _add_loss(self, now_ns: int, lost: Mapping[str, int]) -> None:
-        """Add a loss to the last loss, or start the next loss."""
-        self._loss = {} if now_ns - self._loss_ns > MINUTE_NS else self._loss
-        self._loss_ns = now_ns
-        for name, count in lost.items():
-            self._loss[name] = self._loss.get(name, 0) + count
-        if "unknown" in lost:
-            self._steady_ns = now_ns
-
-    def status(self, last_sample_ns: int) -> RecentStatus:
-        """Return the counts."""
-        (_, samples, bytes_in, before), last = self._seconds[0], self._seconds[-1]
-        causes = _by_cause(before, last[3])
-        gaps = causes.pop("unknown", 0)
-        known = dict(self._loss)
-        known.pop("unknown", 0)
-        return RecentStatus(
-            self._begun_ns, self.steady_rate_hz(), last[1] - samples, causes, gaps,
-            last[2] - bytes_in, len(self._restarts), last_sample_ns, self._loss_ns,
-            sum(known.values()), max(known, key=lambda name: known[name], default=""),
-        )  # fmt: skip
-
-    def rate_hz(self) -> float:
-        """Return the rate of received samples over the last SHORT_NS; 0.0 without two counts."""
-        now_ns, count, *_ = self._seconds[-1]
-        first = next((one for one in reversed(self._seconds) if one[0] <= now_ns - SHORT_NS), self._seconds[0])
-        span_ns = now_ns - first[0]
-        return (count - first[1]) * NS_PER_S / span_ns if span_ns > 0 else 0.0
-
-    def steady_rate_hz(self) -> float | None:
-        """Return the rate of received and lost samples; None without a steady rate or after a gap of unknown size."""
-        seconds = self._seconds
-        if self._steady_hz and self._timed and len(seconds) > RATE_SECONDS:
-            now_ns, samples, _, lost = seconds[-1]
-            begin_ns, samples_before, _, lost_before = seconds[-RATE_SECONDS]
-            if now_ns - begin_ns < RATE_WINDOW_NS:  # a second can be 50 ms shorter
-                begin_ns, samples_before, _, lost_before = seconds[-RATE_SECONDS - 1]
-            if begin_ns >= self._steady_ns and now_ns - begin_ns >= RATE_WINDOW_NS:
-                lost_now = 0 if lost == lost_before else sum(lost) - sum(lost_before)
-                return (samples - samples_before + lost_now) * NS_PER_S / (now_ns - begin_ns)
-        return None
 
 
 # --- hysteresis -------------------------------------------------------------------------------------------------------
@@ -564,11 +465,13 @@ class ConditionJudge:
         self._facts: Facts | None = None
         self._known: Known | None = None  # argument of the last `judge`
 
-    def judge(self, now_ns: int, rate_hz: float, t_err_ns: int, last_sample_ns: int, known: Known) -> bool:
+    def judge(
+        self, now_ns: int, rate_hz: float, t_err_ns: int, last_sample_ns: int, known: Known, newest_ns: int = 0
+    ) -> bool:
         """Update the counts and the condition. Return whether the rules ran: they give the same result for the same
-        facts. `rate_hz`: expected rate."""
+        facts. `rate_hz`: expected rate. `newest_ns`: time stamp of the newest sample, 0 without a sample."""
         self.due_ns, self.state, counts, watch = now_ns + JUDGE_NS, known.state, self.counts, self.watch
-        has_losses = counts.add(now_ns, rate_hz if known.state is RUNNING else 0.0, known.resets)
+        has_losses = counts.add(now_ns, rate_hz if known.state is RUNNING else 0.0, known.resets, newest_ns)
         is_same, self._known = known == self._known, known
         if (
             is_same
@@ -589,6 +492,15 @@ class ConditionJudge:
         )  # fmt: skip
         watch.update(now_ns, causes_of(facts, self._limits))
         return True
+
+    def add_new_losses(self, now_ns: int, last_sample_ns: int) -> None:
+        """Update the condition if the ledger contains losses that the last `judge` did not know. The sentences of a
+        reply then agree with its ledger."""
+        if self._facts is None or not self.counts.add_new_losses(now_ns):
+            return
+        recent = self.counts.status(last_sample_ns)
+        self._facts = facts = msgspec.structs.replace(self._facts, now_ns=now_ns, recent=recent)
+        self.watch.update(now_ns, causes_of(facts, self._limits))
 
 
 def _serial_ports() -> Sequence[str]:

@@ -10,7 +10,7 @@ A device has a transport, which owns the link and the sample path, and attachmen
 
 import asyncio
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -50,7 +50,7 @@ from imud.model.errors import BadArgument, LinkBusy, LinkError, LinkMissing
 from imud.model.event import EventKind
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_MS, NS_PER_S
-from imud.recording.observer import ClockObserver, PathObserver
+from imud.recording.observer import PathObserver
 from imud.sampling.meters import LatencyMeter
 from imud.sampling.path import SamplePath
 
@@ -195,13 +195,14 @@ class Device:
         has_settings = bool(settings.declared or settings.is_unsaved or settings.comparison.problem)
         axes, axes_problem = self._attitude.problem(transport.driver, settings, transport.axes_problem)
         t_err_ns, last_ns = 0, path.last_sample_ns if path is not None else 0
+        newest = path.newest if path is not None else None
         if path is not None and self.config.condition.t_err_ms is not None:
             t_err_ns = path.quality[1]
         self._judge.judge(now_ns, rate_hz, t_err_ns, last_ns, Known(
             health.state, health.problem, settings.resets - settings.resets_requested, transport.is_polled,
             settings.status() if has_settings else None, axes, axes_problem, lines,
             path is not None and path.clock.has_scattered_time, utc_problem, ledger.bytes_open(), ledger.frames_open(),
-        ))  # fmt: skip
+        ), newest.t_ns if newest is not None else 0)  # fmt: skip
 
     def _tick_flow(self, path: SamplePath, now_ns: int) -> None:
         """Flush an idle link, and detect silence and the first sample. Not necessary while recent samples arrive."""
@@ -434,6 +435,8 @@ class Device:
         transport, health, path = self._transport, self._health, self._transport.path
         driver, newest = transport.driver, path.newest if path is not None else None
         latency = path.latency if path is not None else LatencyMeter()
+        last_sample_ns = path.last_sample_ns if path is not None else 0
+        self._judge.add_new_losses(self._host.now_ns(), last_sample_ns)
         frame = self._attitude.status(driver, path, self.settings)
         bits = status_bits_of(driver, self.config.attitude) if driver else {}
         status = DeviceStatus(
@@ -471,47 +474,9 @@ class Device:
             noise=self.config.noise,
             resets_requested=self.settings.resets_requested,
             condition=self._judge.watch.condition,
-            recent=self._judge.counts.status(path.last_sample_ns if path else 0),
+            recent=self._judge.counts.status(last_sample_ns),
             history=self._judge.watch.history,
             calibration=self._calibration.status,
             work=self.settings.lock.work,
         )
         return transport.add_status(status)
-
-
-class RecordableDevices:
-    """Devices and host clocks of a daemon for recorders. Synchronization: the event loop's thread only."""
-
-    def __init__(self, devices: Mapping[str, Device], host: HostClock) -> None:
-        """`devices` contains the present devices at each call."""
-        self._devices = devices
-        self._clocks = ClockObserver(host)
-
-    def names(self) -> Sequence[str]:
-        """Return the names of the present devices."""
-        return list(self._devices)
-
-    def begin_host(self, put: PutRecord) -> None:
-        """Send the state of the host's clocks to `put`, then each reading. A second call sends the state again."""
-        self._clocks.begin(put)
-
-    def begin(self, device: str, put: PutRecord) -> None:
-        """Send the description of a device to `put`, then each input. Do nothing if the device does not exist.
-
-        A second call sends the description again.
-        """
-        found = self._devices.get(device)
-        if found is not None:
-            found.record(put)
-
-    def check(self, device: str, put: PutRecord) -> None:
-        """Send the newest sample and the ledger of a device to `put`. Do nothing if the device does not exist."""
-        found = self._devices.get(device)
-        if found is not None:
-            found.observer.check(put)
-
-    def end(self, put: PutRecord) -> None:
-        """Send no more records of the devices and of the host to `put`."""
-        for device in self._devices.values():
-            device.observer.end(put)
-        self._clocks.end(put)

@@ -17,8 +17,8 @@ from imud.contracts.script import RequestScript, pause
 from imud.contracts.setting import OnDifference, SettingsState
 from imud.contracts.status import DeviceState, KernelCounters
 from imud.device.can_transport import CanBuses
-from imud.device.device import RecordableDevices
 from imud.device.latency import Need
+from imud.device.recordable import RecordableDevices
 from imud.drivers import DRIVERS
 from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
 from imud.drivers.hipnuc.j1939.codec import HipnucJ1939Options

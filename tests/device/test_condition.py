@@ -119,7 +119,7 @@ LATE = facts(t_err_ns=2_100_000)
         (facts(DeviceState.MISSING, "can0 is down", place=BUS), "missing", "can0 is down.", DOCTOR),
         (facts(DeviceState.SEARCHING, "nothing came", place=BUS), "missing", "No data arrives at can0.",
          "Check the power supply, and check the wires and the bit rate of the bus."),
-        (facts(), "ok", "No sample was lost since imud started 14 min ago.", ""),
+        (facts(), "ok", "No sample was lost since imud started to read this device 14 min ago.", ""),
         (lost_before(600, 19, "overrun"), "ok",
          "19 samples were lost 10 min ago in a kernel buffer overrun. No sample was lost after that.", ""),
         (lost_before(1, 1, "crc"), "ok",
@@ -256,67 +256,6 @@ def test_text_of_a_condition_and_status_of_another_version() -> None:
     assert (status.has_problem, status.word, status.reasons) == (False, "running", ())
 
 
-class Counted:
-    """Counts of a device that sends 50 samples per second."""
-
-    def __init__(self, *, timed: bool = True) -> None:
-        self.ledger, self.now_s, self.resets, self.expected_hz = Ledger(), 0, 0, 50.0
-        self.counts = device_condition.RecentCounts(self.ledger, 0, timed=timed)
-
-    def pass_seconds(self, seconds: int, samples: int = 50, **lost: int) -> RecentStatus:
-        for _ in range(seconds):
-            self.now_s += 1
-            self.ledger.samples += samples
-            for name, count in lost.items():
-                setattr(self.ledger, name, getattr(self.ledger, name) + count)
-            self.counts.add(self.now_s * S, self.expected_hz, self.resets)
-        return self.counts.status(self.now_s * S)
-
-
-def test_losses_of_the_last_minute_by_cause_and_restarts_of_the_last_hour() -> None:
-    counted = Counted()
-    counted.pass_seconds(30, lost_crc=2, lost_queue=1)
-    found = counted.pass_seconds(29, lost_unknown=1)
-    assert (found.samples, found.lost, found.gaps) == (59 * 50, {"crc": 60, "queue": 30}, 29)
-    assert (found.loss_ns, found.loss_samples, found.loss_cause) == (59 * S, 90, "crc")
-    counted.pass_seconds(59)
-    assert counted.pass_seconds(1, lost_queue=1).loss_samples == 91  # 60 s after the previous loss
-    later = counted.pass_seconds(61)
-    assert (later.samples, later.lost, later.gaps) == (60 * 50, {}, 0)
-    assert (later.loss_ns, later.loss_samples) == (119 * S, 91)
-    again = counted.pass_seconds(1, lost_overrun=1)
-    assert (again.loss_samples, again.loss_cause) == (1, "overrun")
-    counted = Counted()
-    counted.resets = 2
-    assert counted.pass_seconds(1).restarts == 2
-    counted.now_s += 3599
-    assert counted.pass_seconds(1).restarts == 0
-    counted.resets = 1000
-    assert counted.pass_seconds(1).restarts == 60
-
-
-def test_the_rate_contains_lost_samples_and_the_short_rate_falls_to_zero() -> None:
-    counted = Counted()
-    assert counted.pass_seconds(9).rate_hz is None
-    counted.pass_seconds(5, samples=45, lost_crc=5)
-    assert counted.pass_seconds(11, samples=45).rate_hz == 45.0
-    assert counted.pass_seconds(1, lost_unknown=1).rate_hz is None
-    counted.pass_seconds(12)
-    for counted.expected_hz, rate_hz in ((50.4, 50.0), (50.6, None), (25.0, None)):  # the device changed its rate
-        assert counted.pass_seconds(1).rate_hz == rate_hz
-    assert counted.pass_seconds(9, samples=25).rate_hz is None
-    assert counted.pass_seconds(2, samples=25).rate_hz == 25.0
-    assert Counted(timed=False).pass_seconds(30).rate_hz is None
-    counted = Counted()
-    assert counted.counts.rate_hz() == 0.0
-    counted.pass_seconds(4)
-    assert counted.counts.rate_hz() == 50.0
-    counted.pass_seconds(1, samples=25)
-    assert counted.counts.rate_hz() == 37.5
-    counted.pass_seconds(2, samples=0)
-    assert counted.counts.rate_hz() == 0.0
-
-
 class Judged:
     """Judge of a device that sends 50 samples per second."""
 
@@ -335,7 +274,7 @@ class Judged:
             self.now_ns += S
             self.ledger.samples += samples
             known = device_condition.Known(state, problem)
-            has_run = self.judge.judge(self.now_ns, 50.0, 0, self.now_ns, known)
+            has_run = self.judge.judge(self.now_ns, 50.0, 0, self.now_ns, known, self.now_ns)
         return not has_run
 
 
@@ -343,7 +282,7 @@ def test_the_rules_run_again_after_a_change_of_a_fact_and_after_5_s() -> None:
     judged = Judged()
     assert not judged.is_steady()
     assert judged.is_steady(20)
-    assert judged.judge.watch.condition.reasons[0].message.endswith("since imud started 21 s ago.")
+    assert judged.judge.watch.condition.reasons[0].message.endswith("since imud started to read this device 21 s ago.")
     judged.ledger.lost_crc += 1
     assert not judged.is_steady(60)  # the loss is in the last minute
     assert judged.is_steady(2)
@@ -353,6 +292,12 @@ def test_the_rules_run_again_after_a_change_of_a_fact_and_after_5_s() -> None:
     assert judged.is_steady(2)
     assert not judged.is_steady(10, samples=40)
     assert judged.judge.watch.condition.condition is Condition.DEGRADED
+    judged = Judged()
+    judged.is_steady(20)
+    judged.ledger.lost_crc += 354
+    judged.judge.add_new_losses(judged.now_ns, judged.now_ns)  # a client requests the status between two seconds
+    assert judged.judge.watch.condition.reasons[0].message.startswith("354 samples were lost 0 s ago")
+    assert judged.judge.counts.status(judged.now_ns).lost == {"crc": 354}
     judged = Judged()
     judged.is_steady(20)
     levels = []

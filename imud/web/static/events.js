@@ -124,7 +124,7 @@ export class EventsSection {
     const isFirst = !this.now_s;
     this.now_s = now_s;
     this.begun_ns = status.recent?.begun_ns ?? 0;
-    const begun = this.begun_ns ? ` since imud started at ${timeOf(this.begun_ns / 1e9)}` : "";
+    const begun = this.begun_ns ? ` since imud started to read this device at ${timeOf(this.begun_ns / 1e9)}` : "";
     this.last.textContent = `imud keeps the last 1,000 events of each device${begun}. For older events, run: journalctl -u imud`;
     if (isFirst || Math.floor(now_s / 10) !== this.drawn_10s) this.draw();
   }

@@ -22,8 +22,8 @@ from imud import config
 from imud.attitude.gravity import WINDOW_NS
 from imud.contracts.condition import Condition
 from imud.daemon import QUIET_TICK_S, Daemon
-from imud.device.condition import MINUTE_NS
 from imud.device.device import Device
+from imud.device.recent_counts import MINUTE_NS
 from imud.device.watches import AGAIN_NS
 from imud.formats.jsonrpc import encode_request, line_of
 from imud.formats.slot import encode_slot
