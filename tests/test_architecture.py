@@ -150,6 +150,7 @@ LONG_MODULES = {
     "imud.publishers.recorder.flight": "one state machine: the flight recorder",
     "imud.publishers.shm": "one output: rings and their directory",
     "imud.sampling.clock": "one state machine with a fast path",
+    "imud.sampling.device_time": "the device time and the period that it learns",
     "imud.sampling.path": "the path of the samples, for streams, CAN and polled devices",
 }
 LONG_CLASSES = {"SampleClock": "one state machine with a fast path"}

@@ -429,6 +429,15 @@ class SampleClock:
         return self._resets + self._arrivals.resets
 
     @property
+    def has_open_gap(self) -> bool:
+        """Whether the next sample shows if the samples of the newest gap are lost, or late."""
+        return self._time.has_open_gap
+
+    def take_open_gap(self) -> int:
+        """Return the number of samples of the open gap, which are lost. Close the gap."""
+        return self._time.take_open()
+
+    @property
     def has_scattered_time(self) -> bool:
         """Whether the device time does not show lost samples, because it scatters."""
         return self._time.period.is_scattered
@@ -540,11 +549,13 @@ class SampleClock:
             fit, above_ns, device_ns - before_ns, None if self._fit_sync is _ARRIVAL else self._fit_error_ns, t_rx_ns,
             self._t_rx_ns,
         ):  # fmt: skip
-            return self._after_jump(above_ns, ticks, arrival_ns, size_bytes)
+            step_ns = device_ns - before_ns if above_ns < 0.0 else self._jump.first_step_ns
+            return self._after_jump(above_ns, ticks, arrival_ns, size_bytes, time.has_continued(step_ns))
         self.missed = time.missed
         if not waited and fit.add_arrival(device_ns, arrival_ns, trailing_ns, above_ns):
             if self._jump.stood_still(fit, self._fit_error_ns):
-                self._resets += 1  # all frames stay late: the device counter stopped for a time
+                # All frames stay late: the link delays them, or the device counter stopped for a time. The counter
+                # continued, so this is no reset.
                 self._start_fit(arrival_ns)
             elif other := self._delay.corrected(fit, self._period_ns(), size_bytes):
                 self._delay = other  # the link has another delay than expected
@@ -577,40 +588,45 @@ class SampleClock:
             self.missed = time.missed
         else:
             missed = time.missed_since(line, ticks, arrival_ns) if line is not None and not self._known else None
-            self._begin_counter(ticks, arrival_ns, missed)
+            self._begin_counter(ticks, arrival_ns, missed, time.take_open())
             self._resets += self._known
             self._known = True
         self._start_fit(arrival_ns)
 
-    def _begin_counter(self, ticks: int, arrival_ns: int, missed: int | None) -> None:
-        """Start with a new counter value. `missed` is the number of lost samples; None if unknown."""
+    def _begin_counter(self, ticks: int, arrival_ns: int, missed: int | None, missed_before: int) -> None:
+        """Start with a new counter value. `missed` is the number of samples that are lost directly before it, None if
+        unknown; `missed_before` is the number of samples of an earlier gap."""
         if missed is None and self._seq:
             period_ns = self._period_ns()
             if not period_ns or arrival_ns - self._host.steady_ns(self._t_ns) >= GAP_PERIODS * period_ns:
                 self._on_unknown_gap()
-        self.missed = missed or 0
+        self.missed = (missed or 0) + missed_before
         self._line = None
         self._time.begin(ticks)
 
-    def _after_jump(self, above_ns: float, ticks: int, arrival_ns: int, size_bytes: int) -> int:
-        """Return the time of the first frame after a jump of the counter: by UTC if known, else by arrival."""
-        # If the counter only seems to jump, it continues: frames in the fit were delayed, or the present frames are
-        # delayed.
+    def _after_jump(self, above_ns: float, ticks: int, arrival_ns: int, size_bytes: int, has_continued: bool) -> int:
+        """Return the time of the first frame after a jump of the counter: by UTC if known, else by arrival.
+
+        `has_continued`: whether the step of the counter is usual. The counter then only seems to jump: frames in the
+        fit were delayed, for example by a serial device server, or the present frames are delayed. This is no reset.
+        """
         aiding, time = self._aiding, self._time
-        ran_on = above_ns > 0.0 or self._ran_on(time.even_ns, arrival_ns)
+        ran_on = above_ns > 0.0 or has_continued or self._ran_on(time.even_ns, arrival_ns)
         if aiding is not None:
             utc_ns = aiding.utc.above(ticks, arrival_ns, FIRST_SPREAD_NS + self._delay.hold_ns)
             if utc_ns is not None:
                 utc_ns += arrival_ns + time.tick_ns // 2
-                return self._hold_over(aiding, ticks, arrival_ns, utc_ns, time.missed if ran_on else None)
+                missed = time.missed - time.missed_before + time.take_open()
+                return self._hold_over(aiding, ticks, arrival_ns, utc_ns, missed if ran_on else None)
         if ran_on:
             if above_ns > 0.0 and self._jump.is_late_since_gap(time.period.period_ticks * time.tick_ns):
                 self._on_unknown_gap()
-            self._resets += above_ns > 0.0
+            self._resets += above_ns > 0.0 and not has_continued
             self.missed = time.missed
         else:
             self._resets += 1
-            self._begin_counter(ticks, arrival_ns, None)
+            time.take_open()  # the step between two counters does not show lost samples
+            self._begin_counter(ticks, arrival_ns, None, time.missed_before)
         self._start_fit(arrival_ns)
         return self._less_bias(arrival_ns, size_bytes)
 
@@ -629,7 +645,7 @@ class SampleClock:
             t_ns, error_ns = max(utc_ns, newest_ns + 1), aiding.utc.tick_error_ns  # the device restarted its sampling
         elif missed is None and error_ns + tick_ns < period_ns:
             missed = steps - 1
-        self._begin_counter(ticks, arrival_ns, missed)
+        self._begin_counter(ticks, arrival_ns, missed, self._time.missed_before)
         self._start_fit(arrival_ns)
         aiding.utc.confirm()
         self._holdover = holdover = Holdover(self._fit_begin_ns, t_ns, error_ns, tick_ns)

@@ -29,6 +29,13 @@ WHOLE_AFTER: Final = 64
 WHOLE_OFF: Final = 0.5  # Maximum distance of a whole number of ticks from the mean. Beyond that, the rate changed.
 # Maximum number of steps that are stored until the period is known. A device with an even rate needs a few.
 UNJUDGED_MOST: Final = 64
+# Minimum period of a device, ns. No device sends 10,000 samples per second. A shorter step is between two samples that
+# a late task of the device has time-stamped together.
+PERIOD_LEAST_NS: Final = 100 * NS_PER_US
+# Maximum share of the period in a step between two late samples, which follow a longer step and make up for it.
+LATE_SHARE: Final = 1 / 8
+# Minimum period for late samples, ticks. With a shorter period, a step of 0 or 1 tick is usual.
+LATE_LEAST_TICKS: Final = 16
 # Period in ticks below which two samples can be in one tick. With a longer period, the tick contains the same sample.
 EVERY_TICK: Final = 1.5
 # Period in ticks up to which one step can be a single period or contain a lost sample: at 700 Hz and 1 ms, a step of
@@ -55,13 +62,17 @@ class PeriodLearner:
     """
 
     __slots__ = (
-        "_before", "_candidate", "_count", "_even", "_high", "_low", "_odd_at", "_on_unknown_gap", "_outside",
-        "_regular", "_run", "_run_sum", "_scatter", "_spacing", "_steady", "_sum", "_uneven", "_uneven_sum",
-        "_unjudged", "changes", "is_new", "period_ticks",
+        "_before", "_candidate", "_count", "_even", "_high", "_least", "_low", "_odd_at", "_on_unknown_gap", "_outside",
+        "_owed", "_regular", "_run", "_run_sum", "_scatter", "_spacing", "_steady", "_sum", "_uneven", "_uneven_sum",
+        "_unjudged", "changes", "is_late", "is_new", "period_ticks",
     )  # fmt: skip
 
-    def __init__(self, on_unknown_gap: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, on_unknown_gap: Callable[[], None] = lambda: None, least_ticks: int = 0) -> None:
+        """`least_ticks`: maximum step that is not a period, ticks."""
         self._on_unknown_gap = on_unknown_gap
+        self._least = least_ticks
+        self._owed = 0  # number of samples that can be late since the last longer step
+        self.is_late = False  # whether the newest sample is late: it makes up for a part of the last longer step
         self._scatter = 0.0
         self.period_ticks = 0.0  # mean step, ticks; 0 if unknown
         self._sum = self._count = 0.0
@@ -87,18 +98,28 @@ class PeriodLearner:
         """Whether the steps do not show lost samples, because the device time scatters."""
         return self._scatter >= SCATTERED
 
+    @property
+    def can_be_late(self) -> bool:
+        """Whether the counter distinguishes late samples from usual samples."""
+        return self.period_ticks >= LATE_LEAST_TICKS
+
     def add_step(self, ticks: int) -> int:
         """Add the step to the newest sample. Return the number of lost samples in the step."""
         period = self.period_ticks
         off = abs(ticks - max(round(ticks / period), 1) * period) if period else 0.0
         is_off = off > max(1.0, SCATTER_SHARE * period) or len(self._unjudged) == UNJUDGED_MOST
         self._scatter = min(self._scatter + 1, SCATTERED_MOST) if is_off else max(self._scatter - 0.5, 0.0)
+        self.is_late = self._owed > 0 and self.can_be_late and ticks < LATE_SHARE * period
+        if self.is_late:
+            self._owed -= 1
+            return 0
         lost = self._lost_in(ticks)
-        return 0 if self.is_scattered else lost
+        self._owed = 0 if self.is_scattered else lost
+        return self._owed
 
     def _lost_in(self, ticks: int) -> int:
         period = self.period_ticks
-        if ticks <= 0:  # two samples in one tick, or the same sample again
+        if ticks <= self._least:  # two samples in one tick, or the same sample again
             if 0 < period < EVERY_TICK:
                 self._refine(0)
             return 0
@@ -119,12 +140,12 @@ class PeriodLearner:
         newest step was already added, and it is not a step of one counter. The caller reports the gap."""
         if was_added and self._unjudged:
             self._unjudged.pop()
-        self._run = 0
+        self._run = self._owed = 0
         self._low, self._high = 0.0, 1.0
 
     def add_even_steps(self, count: int = 1) -> None:
         """Add `count` steps that equal the period exactly, at least one."""
-        self._run = 0
+        self._run = self._owed = 0
         self._even += count
         self._scatter = max(self._scatter - count / 2, 0.0) if self._scatter else 0.0
 
@@ -264,6 +285,8 @@ FOLLOWED_NS: Final = 15 * NS_PER_US
 # Maximum difference of a step, ns, or one tick. A larger difference is a correction of the counter.
 UNEVEN_NS: Final = 200 * NS_PER_US
 UNEVEN_SHARE: Final = 0.25
+# Maximum number of periods in a step that shows a continued counter. A longer step can be near whole periods by chance.
+CONTINUED_PERIODS: Final = 64
 # number of samples after an uneven step or a gap whose device time the clock compares with the arrivals
 WATCHED: Final = 256
 
@@ -316,8 +339,9 @@ class DeviceTime:
     """
 
     __slots__ = (
-        "_even_for", "_gap", "_phase_ns", "_shift_ns", "_step_ns", "_unsettled", "_unsure_ns", "change", "doubt_ns",
-        "even_ns", "missed", "modulus", "period", "raw_ns", "rephased", "tick_ns", "ticks", "uneven", "watched",
+        "_even_for", "_gap", "_open", "_phase_ns", "_shift_ns", "_step_ns", "_unsettled", "_unsure_ns", "change",
+        "doubt_ns", "even_ns", "missed", "missed_before", "modulus", "period", "raw_ns", "rephased", "tick_ns",
+        "ticks", "uneven", "watched",
     )  # fmt: skip
 
     def __init__(self, tick_ns: int, tick_modulus: int, on_unknown_gap: Callable[[], None] = lambda: None) -> None:
@@ -331,6 +355,8 @@ class DeviceTime:
         self._even_for = 0
         self._step_ns = 0  # newest step of the counter; negative if the backward step is shorter
         self._gap = 0  # lost samples in the last gap while arrivals are compared
+        # Samples of the newest longer step without a decision: they are lost, or late and follow together
+        self._open = 0
         # whether the newest step after many even steps differs from whole periods by more than a tick
         self.uneven = False
         self.doubt_ns = 0.0  # difference between even samples and counter values, ns, that no arrival has confirmed
@@ -340,18 +366,21 @@ class DeviceTime:
         # Whether the device's rate changed. The position of the samples in their ticks is then unknown.
         self.rephased = False
         self.watched = 0  # number of further samples whose device time is compared with the arrivals
-        self.period = PeriodLearner(on_unknown_gap)
+        self.period = PeriodLearner(on_unknown_gap, PERIOD_LEAST_NS // tick_ns if tick_ns else 0)
         self.raw_ns = 0  # unwrapped device time according to the counter, ns
         # `raw_ns` plus the part of a tick that the even rate shows, ns. It does not fall while the counter continues.
         self.even_ns = 0
-        self.missed = 0  # number of lost samples between the two newest samples
+        # Number of samples that are certainly lost since the previous sample. The samples of a longer step can count at
+        # the next step.
+        self.missed = 0
+        self.missed_before = 0  # part of `missed` that is from the previous step
 
     def begin(self, ticks: int) -> None:
         """Set the first counter value of a device, or the first value after a restart of its counter."""
         self.period.restart(was_added=ticks == self.ticks)
         self.ticks = ticks
         self._phase_ns = self._shift_ns = self._unsure_ns = self.doubt_ns = 0.0
-        self.missed = self._gap = self.watched = self._even_for = 0
+        self.missed = self.missed_before = self._gap = self.watched = self._even_for = 0
         self.uneven = self.rephased = False
         self.raw_ns = ticks % self.modulus * self.tick_ns
         self.change.restart(self.even_ns, self.raw_ns)
@@ -386,14 +415,17 @@ class DeviceTime:
         self.raw_ns += step * tick_ns
         if step == period.period_ticks and step and not self.watched:  # fast path, in a third of the time
             period.add_even_steps()
-            self.missed = 0
+            self.missed = self.missed_before = 0
             self._even_for += 1
             self.even_ns += step * tick_ns
             return
         before_ticks = period.period_ticks
-        self.missed = missed = period.add_step(step)
+        missed = period.add_step(step)
         if (missed or self.change.steps) and self.change.is_open(self.even_ns):
             self.missed = self.change.lost(step, missed, before_ticks, period.period_ticks)
+            self.missed_before = 0
+        else:
+            self.missed = self._decide(missed)
         if period.is_new:
             period.is_new, self._unsettled = False, UNSETTLED_MOST
             self._rephase()
@@ -417,6 +449,36 @@ class DeviceTime:
             if phase_ns != held_ns:
                 self._leave_tick(step, off_ns, phase_ns - held_ns)
         self.even_ns = self.raw_ns + int(self._phase_ns + self._shift_ns)
+
+    def _decide(self, missed: int) -> int:
+        """Return the number of samples of the previous longer step that are certainly lost. `missed`: of this step."""
+        if self.period.is_late:
+            self._open -= 1
+            self.missed_before = 0
+            return 0
+        self.missed_before = self._open
+        self._open = missed if self.period.can_be_late else 0
+        return self.missed_before + missed - self._open
+
+    def has_continued(self, step_ns: int) -> bool:
+        """Return whether a step of the device time, ns, shows that the counter continued: it is a small number of whole
+        periods. A device that restarts sets its counter to another value."""
+        period_ns = self.period.period_ticks * self.tick_ns
+        if not period_ns or step_ns <= 0:
+            return False
+        most = CONTINUED_PERIODS if self.period.can_be_late else 1
+        periods = round(step_ns / period_ns)
+        return 1 <= periods <= most and abs(step_ns - periods * period_ns) <= self.tick_ns
+
+    @property
+    def has_open_gap(self) -> bool:
+        """Whether samples of the newest longer step are without a decision."""
+        return self._open > 0
+
+    def take_open(self) -> int:
+        """Return the samples of the newest longer step without a decision: no sample followed, so they are lost."""
+        lost, self._open = self._open, 0
+        return lost
 
     def advance_evenly(self, ticks: int, steps: int) -> None:
         """Set the newest of `steps` counter values, each one period after the other, while `watched` is 0."""
@@ -511,7 +573,9 @@ class DeviceTime:
         shift_ns = self.even_ns - self.raw_ns - self._phase_ns
         self._unsure_ns += shift_ns - self._shift_ns
         self._shift_ns = shift_ns
-        self.missed, self._gap = periods - 1, 0
+        self._gap = 0
+        self._open = periods - 1 if self.period.can_be_late else 0
+        self.missed = self.missed_before + periods - 1 - self._open
         self.change.take_back(self._step_ns // self.tick_ns % self.modulus)
         self.doubt_ns = min(abs(self._step_ns - periods * period_ns), period_ns)
         self.uneven = False
@@ -521,7 +585,9 @@ class DeviceTime:
         back_ns = round(periods * self.period.period_ticks * self.tick_ns)
         self._shift_ns -= back_ns
         self.even_ns -= back_ns
-        self.missed = max(self.missed - periods, 0)
+        not_lost = min(self._open, periods)
+        self._open -= not_lost
+        self.missed = max(self.missed - (periods - not_lost), 0)
         self.change.take_back(round(periods * self.period.period_ticks))
         self._gap -= periods
         self._even_for = 0
@@ -539,16 +605,16 @@ class DeviceTime:
 class JumpDetector:
     """Detector of jumps of the device counter: by one early frame, or by frames that stay late."""
 
-    __slots__ = ("_begin_ns", "_since_ns", "late_reads")
+    __slots__ = ("_since_ns", "first_step_ns", "late_reads")
 
     def __init__(self) -> None:
         self._since_ns = 0
-        self._begin_ns = 0  # device time between the first late frame and the previous frame
+        self.first_step_ns = 0  # device time between the first late frame and the previous frame
         self.late_reads = 0  # number of consecutive late reads
 
     def is_late_since_gap(self, period_ns: float) -> bool:
         """Return whether samples were lost before the first late frame: the counter may have restarted there."""
-        return self.late_reads > 0 and self._begin_ns > GAP_FACTOR * period_ns
+        return self.late_reads > 0 and self.first_step_ns > GAP_FACTOR * period_ns
 
     def reset(self) -> None:
         """Forget late reads: a new fit starts."""
@@ -579,6 +645,6 @@ class JumpDetector:
             self.late_reads = 0
             return False
         if not self.late_reads:
-            self._since_ns, self._begin_ns = t_rx_ns, elapsed_ns
+            self._since_ns, self.first_step_ns = t_rx_ns, elapsed_ns
         self.late_reads += new_read
         return self.late_reads >= JUMP_LATE_READS and t_rx_ns - self._since_ns > NS_PER_S

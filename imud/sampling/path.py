@@ -36,13 +36,7 @@ from imud.contracts.publisher import AS_SENT, Batch, SlotBatch
 from imud.contracts.script import Message, ReplyFrame, TextLine
 from imud.formats import kernel
 from imud.formats.can import CanFrame
-from imud.formats.slot import (
-    DEVICE_ID_MOST,
-    SLOT_BYTES,
-    decode_slots,
-    encode_slot,
-    slot_quality,
-)
+from imud.formats.slot import DEVICE_ID_MOST, SLOT_BYTES, decode_slots, encode_slot, slot_quality
 from imud.host.clock import HostClock
 from imud.model.errors import Trouble
 from imud.model.ledger import Ledger
@@ -178,6 +172,7 @@ class SamplePath(ABC):
         try:
             self._flush(now_ns, samples)
         finally:
+            self._close_gap()
             if self.observer is not None:
                 self.observer.call("path", "flush", now_ns)
         if samples:
@@ -189,10 +184,16 @@ class SamplePath(ABC):
         try:
             self._reset(samples)
         finally:
+            self._close_gap()
             if self.observer is not None:
                 self.observer.call("path", "reset")
         if samples:
             self._finish(samples, self.last_data_ns)
+
+    def _close_gap(self) -> None:
+        """Count the samples of an open gap: no late sample follows it."""
+        if self.clock.has_open_gap:
+            self._add_loss(self.clock.take_open_gap())
 
     def _on_begin(self) -> None:  # noqa: B027 - most paths have nothing to prepare
         """Prepare for the data of a link after `begin`."""
@@ -228,7 +229,8 @@ class SamplePath(ABC):
                 samples.append(clock.sample(event, t_rx_ns, utc_offset_ns, begin_ns))
                 if clock.missed:
                     self._add_loss(clock.missed)
-                loss.bad_frames = 0
+                if not clock.has_open_gap:
+                    loss.bad_frames = 0
             elif type(event) is TextLine:
                 self._on_message(event.text, t_rx_ns)
             elif type(event) is ReplyFrame:

@@ -505,3 +505,56 @@ def test_a_lower_rate_that_imud_requests_is_no_loss(steps: list[int], lost: int,
             time.advance(time.ticks + step)
             found += time.missed
         assert found == expected
+
+
+# --- late samples -----------------------------------------------------------------------------------------------------
+
+
+def missed_by(steps_us: list[int], tick_ns: int = 1000) -> tuple[list[int], DeviceTime]:
+    """Feed steps of a counter in microseconds after 200 steps of 10 ms. Return the lost samples of each step."""
+    time = DeviceTime(tick_ns, 1 << 32)
+    time.begin(0)
+    missed = []
+    for step_us in [10_000] * 200 + steps_us:
+        time.advance(time.ticks + step_us * 1000 // tick_ns)
+        missed.append(time.missed)
+    assert not any(missed[:200])
+    return missed[200:], time
+
+
+@pytest.mark.parametrize("count", [2, 5, 13, 100])
+def test_burst_of_late_samples_causes_no_loss(count: int) -> None:
+    """A task of the device is late once: its samples have time stamps that are 3 µs apart."""
+    burst_us = [count * 10_000] + [3] * (count - 1)
+    missed, time = missed_by([*burst_us, 10_000 - 3 * (count - 1)] + [10_000] * 50)
+    assert not any(missed)
+    assert time.period.period_ticks == pytest.approx(10_000, rel=1e-3)
+    assert not time.has_open_gap
+
+
+def test_lost_samples_count_when_a_usual_sample_follows() -> None:
+    missed, time = missed_by([130_000])
+    assert (missed, time.has_open_gap) == ([0], True)
+    missed, time = missed_by([130_000, 10_000, 10_000])
+    assert (missed, time.has_open_gap) == ([0, 12, 0], False)
+    missed, _ = missed_by([130_000, 30_000, 10_000])
+    assert missed == [0, 12, 2]
+    missed, _ = missed_by([130_000, 3, 3, 10_000])  # two of the twelve samples were late
+    assert missed == [0, 0, 0, 10]
+    missed, time = missed_by([130_000])
+    assert (time.take_open(), time.has_open_gap) == (12, False)
+
+
+def test_burst_without_a_gap_is_no_period() -> None:
+    missed, time = missed_by([3] * 50 + [10_000] * 20)
+    assert not any(missed)
+    assert time.period.period_ticks == pytest.approx(10_000, rel=1e-3)
+
+
+def test_steps_of_a_burst_are_no_first_period() -> None:
+    time = DeviceTime(1000, 1 << 32)
+    time.begin(0)
+    for step_us in [3] * 12 + [10_000] * 20:
+        time.advance(time.ticks + step_us)
+        assert time.missed == 0
+    assert time.period.period_ticks == 10_000

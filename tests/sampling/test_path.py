@@ -188,6 +188,29 @@ def test_samples_come_in_order_between_messages_and_edges_come_first() -> None:
     assert order == ["edges", "sample 7", "edges"]
 
 
+def test_cause_of_a_gap_that_the_next_sample_decides() -> None:
+    """The counter of an IMU61x has microseconds, so the samples of a gap can be late and follow together."""
+    rig = PathRig("imu61x-uart")
+    path = StreamPath(rig.codec, rig.sample_clock, rig.context)
+
+    def receive(number: int, step_us: int, *events: Any) -> None:
+        rig.codec.results = [([*events, Measurement(40, 0, step_us)], 0)]
+        path.on_data(b"x", rig.now + 10 * number * MS)
+
+    for number in range(100):
+        receive(number, 10_000 * number)
+    receive(102, 1_020_000, BadFrame(BadReason.CRC, b""))
+    assert (rig.ledger.lost(), path.loss.bad_frames) == (0, 1)
+    receive(103, 1_030_000)
+    assert (rig.ledger.lost_crc, rig.ledger.lost_gap_device, path.loss.bad_frames) == (1, 1, 0)
+    receive(106, 1_060_000)
+    path.flush(rig.now + 1200 * MS)  # no sample follows
+    assert (rig.ledger.lost_crc, rig.ledger.lost_gap_device) == (1, 3)
+    receive(200, 2_000_000)
+    path.reset()
+    assert rig.ledger.lost() == 4 + 93
+
+
 def test_an_observer_receives_overruns_and_each_input_of_path_and_clock() -> None:
     rig = PathRig("hipnuc-uart")
     path = rig.stream()
