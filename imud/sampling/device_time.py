@@ -453,7 +453,7 @@ class DeviceTime:
     def _decide(self, missed: int) -> int:
         """Return the number of samples of the previous longer step that are certainly lost. `missed`: of this step."""
         if self.period.is_late:
-            self._open -= 1
+            self._open = max(self._open - 1, 0)
             self.missed_before = 0
             return 0
         self.missed_before = self._open

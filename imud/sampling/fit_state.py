@@ -260,8 +260,10 @@ PERIOD: Final = StateTable(
         Field(19, "changes", COUNT),
         Field(20, "is_new", Flag()),
         Field(21, "period_ticks", Real(0.0, _COUNT_MAX, _TICKS_LEAST)),
+        Field(22, "_owed", COUNT),
+        Field(23, "is_late", Flag()),
     ),
-    {"_on_unknown_gap": DAEMON},
+    {"_on_unknown_gap": DAEMON, "_least": CONSTRUCTOR},
     _finish_period,
 )
 
@@ -297,6 +299,8 @@ DEVICE_TIME: Final = StateTable(
         Field(15, "ticks", TICKS),
         Field(16, "uneven", Flag()),
         Field(17, "watched", Integer(0, device_time.WATCHED)),
+        Field(18, "_open", COUNT),
+        Field(19, "missed_before", COUNT),
     ),
     {"modulus": CONSTRUCTOR, "tick_ns": CONSTRUCTOR},
     _finish_time,
@@ -304,7 +308,7 @@ DEVICE_TIME: Final = StateTable(
 
 JUMP: Final = StateTable(
     (
-        Field(1, "_begin_ns", TIME),
+        Field(1, "first_step_ns", TIME),
         Field(2, "_since_ns", TIME),
         Field(3, "late_reads", COUNT),
     )

@@ -1,5 +1,6 @@
 """Cost of a window of frames: the number of examined periods does not depend on the times of the frames."""
 
+from bisect import bisect_left
 from collections.abc import Sequence
 from random import Random
 from typing import Any
@@ -18,12 +19,12 @@ PERIODS_MAX = 3 * 21 * 82
 @pytest.fixture
 def counts(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Count the examined periods."""
-    found, bisect = [0], same_address.bisect_left
+    found = [0]
 
     def counted(times_ns: Sequence[int], due_ns: int) -> int:
         found[0] += 1
         assert found[0] <= PERIODS_MAX, "too many periods"
-        return bisect(times_ns, due_ns)
+        return bisect_left(times_ns, due_ns)
 
     monkeypatch.setattr(same_address, "bisect_left", counted)
     return found
