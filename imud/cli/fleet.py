@@ -213,6 +213,8 @@ async def _draw(screen: _Screen, overview: FleetOverview, interval_s: float) -> 
 
 
 NAME: Final = "collector"
+# Maximum time for the last write to a server of line protocol after a signal, s. The stop takes at most 1 s.
+LAST_WRITE_S: Final = 0.5
 OPEN: Final = PostAccess()  # no credentials
 HEAD: Final = (
     "GATEWAY",
@@ -336,8 +338,16 @@ async def _collect(args: argparse.Namespace) -> int:
         else:
             stack.enter_context(closing(store))
             collector = FleetCollector(fleet, store, selection)
+
+        loop = asyncio.get_running_loop()
+
+        def stop() -> None:
+            collector.stop()
+            if store is not None and isinstance(store.to, InfluxStore):
+                loop.call_later(LAST_WRITE_S, store.to.stop)
+
         for number in (signal.SIGINT, signal.SIGTERM):
-            asyncio.get_running_loop().add_signal_handler(number, collector.stop)
+            loop.add_signal_handler(number, stop)
         # collections would take a large share of the CPU time at high rates
         with log_to(STDERR, "info"), rare_garbage_collection(GC_ALLOCATIONS):
             await collector.run(stop_after_s=args.duration)
@@ -379,7 +389,8 @@ def store_of(args: argparse.Namespace, fleet: Fleet) -> LedgerStore:
     """Open a store without a ledger of its own. Raises BadArgument, ServerError."""
     url = post_url(args.to)
     if url is not None:
-        return LedgerStore(fleet, InfluxStore(HttpPost(url, PostAccess(args.to_token_file, args.to_ca_file))))
+        access = PostAccess(args.to_token_file, args.to_ca_file)
+        return LedgerStore(fleet, InfluxStore(HttpPost(url, access, monotonic_ns)))
     if args.to == "-":
         return LedgerStore(fleet, JsonLines(sys.stdout))
     raise BadArgument(

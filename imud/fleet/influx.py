@@ -17,14 +17,12 @@ from imud.fleet.collector import Offsets
 from imud.fleet.messages import Interval, MessageKind
 from imud.fleet.reader import FleetBatch
 from imud.formats.influx import DistinctTimes, Tags, Value, cut, event_fields, head, line, measure_fields, sample_fields
-from imud.host.http_post import HttpPost, RequestRejected
+from imud.host.http_post import HttpPost, RequestRejected, RequestTooLarge, halves_of
 from imud.model.errors import ServerError, reason_of
 
 log = logging.getLogger(__name__)
 
 REQUEST_BYTES: Final = 1_000_000  # maximum size of a request, bytes
-# Status codes that the values of a message can cause. Other codes of the server concern all messages.
-OF_VALUES: Final = frozenset((400, 413, 422))
 # Number of attempts after a failure, and the pause before each, s. The restart of a server takes some seconds.
 ATTEMPTS: Final = 20
 ATTEMPT_PAUSE_S: Final = 0.5
@@ -35,6 +33,8 @@ class InfluxStore:
 
     def __init__(self, post: HttpPost, sleep: Callable[[float], None] = time.sleep) -> None:
         self._post, self._sleep = post, sleep
+        self._is_stopping = False
+        self._has_accepted = False  # whether the server has accepted a request
         self.refused = 0  # number of messages with a line that the server could not store
 
     def write(self, batches: Sequence[FleetBatch], offsets: Offsets) -> None:
@@ -53,6 +53,11 @@ class InfluxStore:
                     self.refused += 1
                     log.warning("influx: cannot store a message of %s: %s; ignoring it", gateway, refused)
 
+    def stop(self) -> None:
+        """End the present write: a server without a reply must not delay the end. From any thread."""
+        self._is_stopping = True
+        self._post.stop()
+
     def close(self) -> None:
         """Close the connection. A second call does nothing."""
         self._post.close()
@@ -63,16 +68,35 @@ class InfluxStore:
             self._send_body(body)
 
     def _send_body(self, body: bytes) -> None:
+        """Send complete lines, in smaller requests if the server refuses the size. Send all other lines before the
+        error for a line that is too long alone."""
+        parts = [body]  # the rest, newest part first
+        refusal: RequestTooLarge | None = None
+        while parts:
+            part = parts.pop()
+            try:
+                self._send_part(part)
+                self._has_accepted = True
+            except RequestTooLarge as error:
+                first, second = halves_of(part)
+                if second:
+                    parts += [second, first]
+                elif not self._has_accepted:  # the server refuses each size, which a person can repair
+                    raise ServerError(f"--to: expected the reply 204 to {len(part)} bytes, but {error}") from error
+                else:
+                    refusal = error
+        if refusal is not None:
+            raise refusal
+
+    def _send_part(self, body: bytes) -> None:
         for attempt in range(ATTEMPTS + 1):
             try:
                 self._post.post(body)
-            except RequestRejected as error:
-                if error.status in OF_VALUES:
-                    raise
-                raise ServerError(f"--to: expected the reply 204, but {error}") from error
             except OSError as error:
-                if attempt == ATTEMPTS:
-                    raise ServerError(f"--to: cannot send: {reason_of(error)}") from error
+                if attempt == ATTEMPTS or self._is_stopping:
+                    raise ServerError(
+                        f"--to: cannot send: {reason_of(error)}; the broker keeps the messages for the next collector"
+                    ) from error
                 if not attempt:
                     log.warning("influx: %s; trying again", reason_of(error))
                 self._sleep(ATTEMPT_PAUSE_S)

@@ -1,23 +1,25 @@
 """HTTP client for a thread: sends bodies to one URL with POST over a connection that stays open."""
 
 import gzip
+from collections.abc import Callable
 from pathlib import PurePath
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 from urllib.parse import parse_qsl, urlsplit
 
-from imud.host.files import read_regular
+from imud.host.files import open_regular, read_regular
+from imud.host.http_reply import HttpReply, InvalidReply
 from imud.host.network import tls_context
+from imud.host.timed_connection import TimedConnection
 from imud.model.errors import reason_of
 
-if TYPE_CHECKING:
-    from http.client import HTTPConnection
-
-TIMEOUT_S: Final = 10.0  # maximum wait for a connection, and for each part of a reply, s
-REPLY_BYTES: Final = 4096  # maximum size of the part of a reply that imud reads, bytes
+# Maximum time of a request, from the name resolution to the complete reply, s: 1 MB at 0.5 Mbit/s take 16 s
+REQUEST_S: Final = 20.0
 REASON_CHARACTERS: Final = 200  # maximum length of a server's message in logs and status
 TOKEN_BYTES: Final = 4096  # maximum size of a token file, bytes
-# Status codes that a later attempt can change, although they are codes of client errors (RFC 9110; RFC 6585)
-LATER: Final = frozenset((408, 425, 429))
+TOO_LARGE: Final = 413  # status code "Content Too Large" (RFC 9110, section 15.5.14)
+# Status codes that the values in a body cause. A person can repair the causes of all other codes: access rights (401,
+# 403), a missing database (404), load (429). A later attempt with the same body can then succeed.
+OF_VALUES: Final = frozenset((400, 422))
 SECRETS: Final = frozenset(("u", "p", "token", "password"))  # query parameters that contain secrets
 
 
@@ -36,11 +38,15 @@ class PostAccess(NamedTuple):
 
 
 class RequestRejected(Exception):
-    """The server rejected a body: the same body will fail again."""
+    """The server rejected the values in a body: the same body will fail again."""
 
     def __init__(self, status: int, reason: str) -> None:
         super().__init__(f"the server replied {status}" + f": {reason}" * bool(reason))
         self.status = status
+
+
+class RequestTooLarge(RequestRejected):
+    """The server rejected the size of a body: a smaller body can succeed."""
 
 
 def post_url(text: str) -> PostUrl | None:
@@ -61,51 +67,94 @@ def post_url(text: str) -> PostUrl | None:
 
 
 class HttpPost:
-    """Connection to a URL. Synchronization: one thread at a time. `post` blocks."""
+    """Connection to a URL. Synchronization: one thread at a time; any thread may call `stop`. `post` blocks."""
 
-    def __init__(self, url: PostUrl, access: PostAccess, *, compress: bool = False) -> None:
+    def __init__(self, url: PostUrl, access: PostAccess, now_ns: Callable[[], int], *, compress: bool = False) -> None:
+        """`now_ns` returns CLOCK_MONOTONIC, ns."""
         self._url, self._access, self._compress = url, access, compress
-        self._connection: HTTPConnection | None = None
+        self._connection = TimedConnection(now_ns)
 
     def post(self, body: bytes) -> None:
-        """Send a body. Return after a reply with the status 2xx. Raises RequestRejected for 4xx, and OSError if a later
-        attempt can succeed: without a reply, or with another status."""
-        from http.client import HTTPException
-
-        headers = {"Content-Type": "text/plain; charset=utf-8", "User-Agent": "imud"} | self._authorization()
+        """Send a body. Return after a reply with the status 2xx. Raises RequestTooLarge or RequestRejected for the size
+        and the values of the body, and OSError if a later attempt can succeed: without a complete reply within
+        REQUEST_S, or with another status."""
         if self._compress:
-            body, headers["Content-Encoding"] = gzip.compress(body, 1), "gzip"
+            body = gzip.compress(body, 1)
+        request = self._head(len(body)) + body
         try:
-            connection = self._connection or self._connect()
-            self._connection = connection
-            connection.request("POST", self._url.target, body, headers)
-            reply = connection.getresponse()
-            content = reply.read(REPLY_BYTES)
-            if not reply.isclosed():  # the rest of a long reply would precede the next reply
-                self.close()
-        except (OSError, HTTPException) as error:
+            reply = self._exchange(request)
+        except (OSError, InvalidReply) as error:
             self.close()
             raise OSError(_cause(error)) from error
-        if 200 <= reply.status < 300:
+        if not reply.keeps_connection:
+            self.close()
+
+        status, reason = reply.status, _sentence(bytes(reply.content))
+        if 200 <= status < 300:
             return
-        reason = _sentence(content)
-        if 400 <= reply.status < 500 and reply.status not in LATER:
-            raise RequestRejected(reply.status, reason)
-        raise OSError(f"the server replied {reply.status}" + f": {reason}" * bool(reason))
+        if status == TOO_LARGE:
+            raise RequestTooLarge(status, reason)
+        if status in OF_VALUES:
+            raise RequestRejected(status, reason)
+        raise OSError(f"the server replied {status}" + f": {reason}" * bool(reason))
+
+    def stop(self) -> None:
+        """End the present request and all later requests with OSError. From any thread."""
+        self._connection.stop()
 
     def close(self) -> None:
         """Close the connection. The next `post` opens a new one."""
-        connection, self._connection = self._connection, None
-        if connection is not None:
+        self._connection.close()
+
+    def _exchange(self, request: bytes) -> HttpReply:
+        connection, reply = self._connection, HttpReply()
+        connection.start(REQUEST_S)
+        # input before a request: the server closed the connection, or sent bytes that imud did not request
+        if connection.is_open and connection.has_input():
             connection.close()
+        if not connection.is_open:
+            self._open()
 
-    def _connect(self) -> "HTTPConnection":
-        from http.client import HTTPConnection, HTTPSConnection
+        rest = memoryview(request)
+        while not reply.is_complete:
+            if rest and not reply.status:
+                rest = rest[connection.send(rest) :]
+            data = connection.receive()
+            if data:
+                reply.feed(data)
+            else:
+                reply.end()
+        reply.keeps_connection = reply.keeps_connection and not rest
+        return reply
 
+    def _open(self) -> None:
         host, port, tls, _ = self._url
         if not tls:
-            return HTTPConnection(host, port, timeout=TIMEOUT_S)
-        return HTTPSConnection(host, port, timeout=TIMEOUT_S, context=tls_context(self._access.ca_file))
+            self._connection.open(host, port)
+            return
+        ca_file = self._access.ca_file
+        if ca_file is not None:
+            open_regular(ca_file).close()  # OpenSSL would wait for the writer of a FIFO
+        self._connection.open(host, port, tls_context(ca_file))
+
+    def _head(self, body_bytes: int) -> bytes:
+        """Return request line and headers."""
+        host, port, tls, target = self._url
+        host_header = f"[{host}]" if ":" in host else host
+        if port != (443 if tls else 80):
+            host_header += f":{port}"
+        lines = [
+            f"POST {target} HTTP/1.1",
+            f"Host: {host_header}",
+            "User-Agent: imud",
+            "Accept-Encoding: identity",
+            "Content-Type: text/plain; charset=utf-8",
+            f"Content-Length: {body_bytes}",
+        ]
+        if self._compress:
+            lines.append("Content-Encoding: gzip")
+        lines += [f"{name}: {value}" for name, value in self._authorization().items()]
+        return "\r\n".join([*lines, "\r\n"]).encode("ascii")
 
     def _authorization(self) -> dict[str, str]:
         """Return the header Authorization. Reads the file for each request, so that a new token needs no restart."""
@@ -125,8 +174,8 @@ class HttpPost:
 
 def _cause(error: Exception) -> str:
     """Return the reason of a failed request."""
-    if not isinstance(error, OSError):
-        return f"invalid HTTP reply: {type(error).__name__}"
+    if isinstance(error, InvalidReply):
+        return f"invalid HTTP reply: {error}"
     # the number of a TLS error is not the number of a system error
     return str(getattr(error, "verify_message", "") or getattr(error, "reason", "") or reason_of(error))
 
@@ -135,3 +184,13 @@ def _sentence(content: bytes) -> str:
     """Return the message of a reply as one printable line."""
     text = "".join(c if c.isprintable() else " " for c in content.decode(errors="replace"))
     return " ".join(text.split())[:REASON_CHARACTERS]
+
+
+def halves_of(lines: bytes) -> tuple[bytes, bytes]:
+    """Return two parts of complete lines with about the same size. The second part is empty for a single line."""
+    middle = lines.find(b"\n", len(lines) // 2) + 1
+    if not 0 < middle < len(lines):
+        middle = lines.rfind(b"\n", 0, len(lines) // 2) + 1
+    if not middle:
+        return lines, b""
+    return lines[:middle], lines[middle:]

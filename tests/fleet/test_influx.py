@@ -15,7 +15,7 @@ from imud.fleet.collector import LedgerStore
 from imud.fleet.influx import ATTEMPTS, REQUEST_BYTES, InfluxStore, clock_lines, lines_of
 from imud.fleet.messages import DropCause, FleetMessage, Stream
 from imud.fleet.reader import Fleet, FleetBatch
-from imud.host.http_post import HttpPost, PostAccess, post_url
+from imud.host.http_post import HttpPost, PostAccess, RequestTooLarge, post_url
 from imud.model.errors import BadArgument, ServerError
 from imud.model.event import Event, EventKind
 from tests.fleet.fleet_gateway import (
@@ -30,6 +30,7 @@ from tests.fleet.fleet_gateway import (
 )
 from tests.fleet.mosquitto import Mosquitto
 from tests.support.daemon_process import wait_until
+from tests.support.event_loops import VirtualClock
 from tests.support.line_protocol import NO_INFLUX, FakeDatabase, fake_database, influx_server, parse_line
 
 
@@ -75,7 +76,7 @@ class Rig:
         url = post_url(database.url)
         assert url is not None
         self.pauses: list[float] = []
-        self.store = InfluxStore(HttpPost(url, PostAccess()), self.pauses.append)
+        self.store = InfluxStore(HttpPost(url, PostAccess(), VirtualClock().now_ns), self.pauses.append)
 
     def write(self, *messages: FleetMessage) -> None:
         try:
@@ -100,8 +101,9 @@ def test_messages_are_written_after_failures_of_the_server(database: FakeDatabas
 @pytest.mark.parametrize(
     ("replies", "problem"),
     [
-        ([(401, "bad token")], "expected the reply 204, but the server replied 401: bad token"),
-        ([(404, "no database")], "expected the reply 204, but the server replied 404: no database"),
+        ([(401, "bad token")] * (ATTEMPTS + 1), "cannot send: the server replied 401: bad token; the broker keeps"),
+        ([(404, "no database")] * (ATTEMPTS + 1), "cannot send: the server replied 404: no database"),
+        ([(413, "")] * 2, r"expected the reply 204 to \d+ bytes, but the server replied 413"),
         ([(500, "disk")] * (ATTEMPTS + 1), "cannot send: the server replied 500: disk"),
     ],
 )
@@ -122,6 +124,63 @@ def test_a_rejected_message_affects_only_itself(database: FakeDatabase, caplog: 
     assert [one.fields["seq"] for one in database.lines] == [1, 3]
     assert rig.store.refused == 1
     assert "cannot store a message of gw: the server replied 400: field type conflict; ignoring it" in caplog.text
+
+
+def test_messages_are_written_after_access_is_repaired(database: FakeDatabase) -> None:
+    rig = Rig(database)
+    database.replies = [(401, "")] * 5 + [(404, "no database")] * 5 + [(403, "")] * 5
+    rig.write(samples_message(1, 3))
+    assert [line.fields["seq"] for line in database.lines] == [1, 2, 3]
+    assert rig.store.refused == 0
+
+
+class SizedPost(HttpPost):
+    """Server that refuses requests above a size with 413."""
+
+    def __init__(self, bytes_max: int) -> None:
+        self.bytes_max = bytes_max
+        self.bodies: list[bytes] = []
+
+    def post(self, body: bytes) -> None:
+        if len(body) > self.bytes_max:
+            raise RequestTooLarge(413, "")
+        self.bodies.append(body)
+
+    def close(self) -> None: ...
+
+
+def test_refused_sizes_divide_requests() -> None:
+    post = SizedPost(1000)
+    store = InfluxStore(post)
+    store.write([batch(samples_message(1, 500)), batch(samples_message(501, 900))], {})
+    lines = b"".join(post.bodies).decode().splitlines(keepends=True)
+    assert [parse_line(line).fields["seq"] for line in lines] == list(range(1, 901))
+    assert store.refused == 0
+
+
+def test_long_line_is_ignored_alone() -> None:
+    post = SizedPost(1000)
+    store = InfluxStore(post)
+    long_event = msgspec.structs.replace(
+        event_message(5, 5_000_000),
+        events=[Event(1, "bow", EventKind.UP, "x" * 2000), Event(2, "bow", EventKind.UP, "y")],
+    )
+    store.write([batch(samples_message(1, 9)), batch(long_event, Stream.EVENTS)], {})
+    assert len(set(b"".join(post.bodies).splitlines())) == 10
+    assert store.refused == 1
+
+
+def test_stop_ends_a_write_without_a_reply() -> None:
+    class SilentPost(SizedPost):
+        def post(self, body: bytes) -> None:
+            store.stop()
+            raise OSError("no complete reply")
+
+        def stop(self) -> None: ...
+
+    store = InfluxStore(SilentPost(0))
+    with pytest.raises(ServerError, match="the broker keeps the messages"):
+        store.write([batch(samples_message(1, 9))], {})
 
 
 def test_urls_of_stores() -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from imud.host.http_post import HttpPost, PostAccess, PostUrl, RequestRejected, post_url
+from tests.support.event_loops import VirtualClock
 from tests.support.line_protocol import FakeDatabase, fake_database
 
 BODY = b"m f=1i 1\n"
@@ -14,7 +15,7 @@ BODY = b"m f=1i 1\n"
 def post(database: FakeDatabase, access: PostAccess, *, compress: bool = False) -> HttpPost:
     url = post_url(database.url)
     assert url is not None
-    return HttpPost(url, access, compress=compress)
+    return HttpPost(url, access, VirtualClock().now_ns, compress=compress)
 
 
 def test_parts_of_urls() -> None:
@@ -61,6 +62,8 @@ def test_a_server_without_tls_and_a_missing_ca_file_are_problems() -> None:
         url = post_url(database.url)
         assert url is not None
         with pytest.raises(OSError, match=r"WRONG_VERSION_NUMBER|record layer|HTTP"):
-            HttpPost(url._replace(tls=True), PostAccess()).post(BODY)
+            HttpPost(url._replace(tls=True), PostAccess(), VirtualClock().now_ns).post(BODY)
         with pytest.raises(OSError, match="No such file"):
-            HttpPost(PostUrl("127.0.0.1", url.port, True, "/w"), PostAccess(None, "/absent.pem")).post(BODY)
+            HttpPost(
+                PostUrl("127.0.0.1", url.port, True, "/w"), PostAccess(None, "/absent.pem"), VirtualClock().now_ns
+            ).post(BODY)

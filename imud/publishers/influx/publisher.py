@@ -37,7 +37,8 @@ log = logging.getLogger(__name__)
 
 WHO: Final = "influx"  # name of this output
 LATENCY_NS: Final = NS_PER_S // 10  # maximum hold of samples, ns: databases show seconds
-CLOSE_NS: Final = NS_PER_S  # maximum wait at the end for the last lines of all destinations, ns
+# Maximum wait at the end for the last lines of all destinations, ns. A stop of imud takes at most 1 s.
+CLOSE_NS: Final = NS_PER_S // 2
 
 
 class InfluxOutput:
@@ -120,13 +121,15 @@ class InfluxOutput:
         """Deliver the last lines to receivers that reply within CLOSE_NS. A second call does nothing."""
         self._context.outputs.ports.pop(WHO, None)
         self._context.latencies.release(WHO)
-        for one in self.destinations:
-            one.finish()
+        for destination in self.destinations:
+            destination.finish()
         end_ns = self._context.clock.now_ns() + CLOSE_NS
-        for one in self.destinations:
-            if isinstance(one, QueuedDestination):
-                one.wait(max(end_ns - self._context.clock.now_ns(), 0) / NS_PER_S)
-            one.close()
+        for destination in self.destinations:
+            if isinstance(destination, QueuedDestination):
+                destination.wait(max(end_ns - self._context.clock.now_ns(), 0) / NS_PER_S)
+                destination.stop()
+        for destination in self.destinations:
+            destination.close()
         self.destinations.clear()
 
     def status(self) -> list[OutputStatus]:
@@ -145,19 +148,19 @@ class InfluxOutput:
             return UdpDestination(url, address)
         settings = self._settings
         limits = round(settings.queue_mb * MEGABYTE), round(settings.batch_s * NS_PER_S)
-        made = QueuedDestination(
-            url, delivery_of(url, options), limits, self._context.clock.now_ns, self._start_worker
-        )  # fmt: skip
-        made.start()
-        return made
+        now_ns = self._context.clock.now_ns
+        destination = QueuedDestination(url, delivery_of(url, options, now_ns), limits, now_ns, self._start_worker)
+        destination.start()
+        return destination
 
 
-def delivery_of(url: str, options: DestinationOptions) -> LineDelivery:
+def delivery_of(url: str, options: DestinationOptions, now_ns: Callable[[], int]) -> LineDelivery:
     """Return the transport for a valid URL, except UDP."""
     if (path := file_path(url)) is not None:
         return FileDelivery(path, round(options.file_mb * MEGABYTE), options.files)
     if (address := socket_address(url, "tcp")) is not None:
-        return TcpDelivery(address)
+        return TcpDelivery(address, now_ns)
     target = post_url(url)
     assert target is not None, url  # InfluxOptions checked it
-    return HttpDelivery(HttpPost(target, PostAccess(options.token_file, options.ca_file), compress=options.gzip))
+    access = PostAccess(options.token_file, options.ca_file)
+    return HttpDelivery(HttpPost(target, access, now_ns, compress=options.gzip))

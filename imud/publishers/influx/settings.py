@@ -1,10 +1,14 @@
 """Options of the output `influx`."""
 
+import os
+from collections.abc import Mapping
+from contextlib import suppress
 from typing import Annotated, Final
 from urllib.parse import urlsplit
 
 import msgspec
 
+from imud.contracts.driver import Driver
 from imud.contracts.publisher import PublisherType, make_later
 from imud.host.http_post import post_url
 from imud.model.options import Options, is_ip_address, shown
@@ -99,6 +103,36 @@ class InfluxOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tr
                 )
 
 
+def check_files(options: InfluxOptions, _drivers: Mapping[str, Driver]) -> Mapping[tuple[str, ...], str]:
+    """Return the error if two destinations would write to the same file, by the path of the key."""
+    urls: dict[tuple[object, ...], str] = {}  # first URL of each file
+    for url, destination in options.to.items():
+        path = file_path(url)
+        if path is None:
+            continue
+        rotated = [f"{path}.{number}" for number in range(1, destination.files)]
+        identities = {identity for name in (path, *rotated) for identity in _identities_of(name)}
+        other_url = next((urls[identity] for identity in identities if identity in urls), None)
+        if other_url is not None:
+            problem = f"expected a file of its own for each destination, got {shown(other_url)} and {shown(url)}"
+            return {("to",): f"{problem}, which write to the same file"}
+        urls |= dict.fromkeys(identities, url)
+    return {}
+
+
+def _identities_of(path: str) -> list[tuple[object, ...]]:
+    """Return the keys that are equal for two names of one file: through links, `.` and `..`, and hard links."""
+    identities: list[tuple[object, ...]] = [("path", os.path.realpath(path))]
+    with suppress(OSError):
+        status = os.stat(path)
+        identities.append(("inode", status.st_dev, status.st_ino))
+    return identities
+
+
 PUBLISHER = PublisherType(
-    "influx", InfluxOptions, make_later("imud.publishers.influx.publisher:InfluxOutput"), required=False
+    "influx",
+    InfluxOptions,
+    make_later("imud.publishers.influx.publisher:InfluxOutput"),
+    required=False,
+    check=check_files,
 )

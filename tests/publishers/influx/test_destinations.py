@@ -2,15 +2,18 @@
 
 import os
 import socket
+import threading
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
-from imud.host.http_post import HttpPost, PostAccess, PostUrl, post_url
+from imud.host.http_post import HttpPost, PostAccess, PostUrl, RequestTooLarge, post_url
 from imud.host.threads import Job
 from imud.model.units import NS_PER_S
 from imud.publishers.influx.destinations import (
+    BATCH_BYTES,
     DATAGRAM_BYTES,
     IDLE_NS,
     FileDelivery,
@@ -43,6 +46,10 @@ class FakeDelivery:
         self.fails: list[Exception | None] = []
         self.got: list[bytes] = []
         self.while_sending: Callable[[], object] = lambda: None
+        self.is_stopped = False
+
+    def stop(self) -> None:
+        self.is_stopped = True
 
     def send(self, batch: bytes) -> None:
         self.while_sending()
@@ -150,7 +157,7 @@ def test_an_internal_error_is_a_problem() -> None:
 def http_rig(database: FakeDatabase, *, compress: bool = False) -> Rig:
     url = post_url(database.url)
     assert url is not None
-    return Rig(HttpDelivery(HttpPost(url, PostAccess(), compress=compress)))
+    return Rig(HttpDelivery(HttpPost(url, PostAccess(), VirtualClock().now_ns, compress=compress)))
 
 
 @pytest.mark.parametrize(
@@ -158,12 +165,15 @@ def http_rig(database: FakeDatabase, *, compress: bool = False) -> Rig:
     [
         ((204, ""), (1, 1, 0, 0), ""), ((200, "{}"), (1, 1, 0, 0), ""),
         ((400, "partial\nwrite"), (1, 0, 0, 1), 'the server replied 400: partial write; imud dropped 1 lines'),
-        ((401, ""), (1, 0, 0, 1), "the server replied 401; imud dropped 1 lines"),
-        ((404, "x" * 9000), (1, 0, 0, 1), f"the server replied 404: {'x' * 200}; imud dropped 1 lines"),
+        ((422, ""), (1, 0, 0, 1), "the server replied 422; imud dropped 1 lines"),
+        ((401, ""), (1, 0, 1, 0), "the server replied 401; trying again"),
+        ((403, "read only"), (1, 0, 1, 0), "the server replied 403: read only; trying again"),
+        ((404, "x" * 9000), (1, 0, 1, 0), f"the server replied 404: {'x' * 200}; trying again"),
+        ((413, ""), (1, 0, 1, 0), "the server replied 413 to a request of 9 bytes; trying again"),
         ((429, "slow"), (1, 0, 1, 0), "the server replied 429: slow; trying again"),
         ((302, ""), (1, 0, 1, 0), "the server replied 302; trying again"),
         ((503, "busy"), (1, 0, 1, 0), "the server replied 503: busy; trying again"),
-        ((0, ""), (1, 0, 1, 0), "Remote end closed connection without response; trying again"),
+        ((0, ""), (1, 0, 1, 0), "the server closed the connection without a reply; trying again"),
     ],
 )  # fmt: skip
 def test_replies(database: FakeDatabase, reply: tuple[int, str], account: tuple[int, ...], problem: str) -> None:
@@ -189,7 +199,9 @@ def test_a_lost_reply_repeats_equal_lines_and_an_absent_server_is_a_problem(data
     assert database.bodies == [ONE, ONE], "the database identifies the row by series and time"
     assert rig.balanced() == (1, 1, 0, 0)
     rig.one.close()
-    absent = Rig(HttpDelivery(HttpPost(PostUrl("127.0.0.1", free_port(), False, "/write"), PostAccess())))
+    absent = Rig(
+        HttpDelivery(HttpPost(PostUrl("127.0.0.1", free_port(), False, "/write"), PostAccess(), VirtualClock().now_ns))
+    )
     absent.put(ONE)
     absent.run()
     assert absent.one.status().problem == "Connection refused; trying again"
@@ -226,7 +238,7 @@ def test_datagrams_have_complete_lines_of_at_most_1400_bytes() -> None:
 
 def test_a_tcp_connection_begins_with_a_complete_batch_after_a_failure() -> None:
     listener, address = receiver(socket.SOCK_STREAM)
-    one = TcpDelivery(address)
+    one = TcpDelivery(address, VirtualClock().now_ns)
     listener.listen()
     for number in range(3):
         one.send(b"m f=%di 1\n" % number)
@@ -241,36 +253,214 @@ def test_a_tcp_connection_begins_with_a_complete_batch_after_a_failure() -> None
     one.close()
 
 
+def test_tcp_receiver_that_floods_ends_the_batch() -> None:
+    """The receiver reads nothing and sends without end: imud ignores a limited number of bytes."""
+    listener, address = receiver(socket.SOCK_STREAM)
+    listener.listen()
+
+    def flood() -> None:
+        accepted, _ = listener.accept()
+        with accepted, suppress(OSError):
+            while True:
+                accepted.sendall(bytes(1 << 16))
+
+    thread = threading.Thread(target=flood)
+    thread.start()
+    one = TcpDelivery(address, VirtualClock().now_ns)
+    with pytest.raises(OSError, match=r"sends nothing, got \d+ bytes"):
+        one.send(bytes(50_000_000))
+    thread.join()
+    listener.close()
+    with pytest.raises(OSError):  # noqa: PT011 - the stopped delivery connects to nothing
+        one.send(ONE)
+
+
 def files_of(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
+def imud_line(text: str) -> bytes:
+    return f"imud_{text}\n".encode()
+
+
 def test_a_file_rotates_and_continues_after_a_restart(tmp_path: Path) -> None:
     path = tmp_path / "lines"
-    one = FileDelivery(str(path), 20, 3)
-    for batch in (b"a\n", b"b" * 17 + b"\n", b"c" * 30 + b"\n", b"d\n", b"e" * 19 + b"\n", b"f\n"):
+    one = FileDelivery(str(path), 25, 3)
+    c = imud_line("c" * 35)
+    e = imud_line("e" * 19)
+    for batch in (imud_line("a"), imud_line("b" * 17), c, imud_line("d"), e, imud_line("f")):
         one.send(batch)
-    e, c = b"e" * 19 + b"\n", b"c" * 30 + b"\n"
-    assert files_of(tmp_path) == {"lines": b"f\n", "lines.1": e, "lines.2": b"d\n"}, c
+    assert files_of(tmp_path) == {"lines": imud_line("f"), "lines.1": e, "lines.2": imud_line("d")}, c
     one.close()
     with path.open("ab") as file:
-        file.write(b"half a li")
-    one.send(b"g\n")
-    assert path.read_bytes() == b"f\ng\n", "the incomplete line of a power failure is removed"
+        file.write(b"imud_half a li")
+    one.send(imud_line("g"))
+    assert path.read_bytes() == b"imud_f\nimud_g\n", "the incomplete line of a power failure is removed"
     path.rename(tmp_path / "moved")
-    one.send(b"h\n")
-    assert path.read_bytes() == b"h\n", "another program moved the file"
+    one.send(imud_line("h"))
+    assert path.read_bytes() == imud_line("h"), "another program moved the file"
     one.close()
-    single = FileDelivery(str(path), 3, 1)
-    for batch in (b"i\n", b"j\n"):
+    single = FileDelivery(str(path), 8, 1)
+    for batch in (imud_line("i"), imud_line("j")):
         single.send(batch)
-    assert path.read_bytes() == b"j\n"
+    assert path.read_bytes() == imud_line("j")
     single.close()
+
+
+FOREIGN_FILES = {
+    "without a line end": b"x" * 65_536, "text": b"root:x:0:0\n", "zeros": bytes(100), "short": b"imx",
+    "cut": b"imud_a f=1i 1\nforeign", "longer than the tail": b"imud_a\n" + b"x" * 70_000,
+    "zeros after a power failure": b"imud_a f=1i 1\n" + bytes(10),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("content", FOREIGN_FILES.values(), ids=list(FOREIGN_FILES))
+def test_foreign_file_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "lines"
+    path.write_bytes(content)
+    one = FileDelivery(str(path), 10**6, 3)
+    for _ in range(2):
+        with pytest.raises(OSError, match=r"data that imud did not write; set another path in influx\.to"):
+            one.send(imud_line("a"))
+    assert path.read_bytes() == content
+    one.close()
+
+
+@pytest.mark.parametrize("name", ["lines.1", "lines.2"])
+def test_rotation_keeps_foreign_file(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"foreign")
+    one = FileDelivery(str(tmp_path / "lines"), 10, 3)
+    one.send(imud_line("a"))
+    with pytest.raises(OSError, match=f"{name} contains data that imud did not write"):
+        one.send(imud_line("b" * 9))
+    assert files_of(tmp_path) == {"lines": imud_line("a"), name: b"foreign"}
+    one.close()
+
+
+class SizedReceiver(FakeDelivery):
+    """Receiver that refuses requests above a size with 413."""
+
+    def __init__(self, bytes_max: int) -> None:
+        super().__init__()
+        self.bytes_max = bytes_max
+        self.refusals = 0
+
+    def send(self, batch: bytes) -> None:
+        if len(batch) > self.bytes_max:
+            self.refusals += 1
+            raise RequestTooLarge(413, "")
+        super().send(batch)
+
+
+def test_refused_sizes_divide_requests() -> None:
+    receiver = SizedReceiver(100)
+    rig = Rig(receiver, 10**6)
+    for first in (0, 1000):
+        rig.put(b"".join(b"m f=%04di 1\n" % number for number in range(first, first + 1000)))
+    while rig.run(1) != IDLE_NS:
+        pass
+    numbers = [int(line[4:8]) for batch in receiver.got for line in batch.splitlines()]
+    assert numbers == list(range(2000))
+    assert (rig.balanced(), rig.one.status().problem) == ((2000, 2000, 0, 0), "")
+    # 8 halves of 24 kB, and 3 tests of twice the size during 300 requests
+    assert receiver.refusals <= 11, "imud remembers the accepted size"
+
+
+def test_long_line_is_dropped_alone() -> None:
+    receiver = SizedReceiver(100)
+    rig = Rig(receiver, 10**6)
+    long_line = b"m f=" + b"1" * 200 + b"i 1\n"
+    rig.put(ONE * 20 + long_line + ONE * 20)
+    while rig.run(1) != IDLE_NS:
+        pass
+    assert rig.balanced() == (41, 40, 0, 1)
+    assert b"".join(receiver.got) == ONE * 40
+
+
+def test_lines_wait_while_every_size_is_refused() -> None:
+    receiver = SizedReceiver(0)
+    rig = Rig(receiver, 10**6)
+    rig.put(ONE * 10)
+    for _ in range(1000):
+        rig.run(1)
+    assert rig.balanced() == (10, 0, 10, 0)
+    assert receiver.refusals < 40, "the pause grows"
+    receiver.bytes_max = 1000
+    while rig.run(60) != IDLE_NS:
+        pass
+    assert rig.balanced() == (10, 10, 0, 0)
+
+
+def test_size_of_requests_grows_again() -> None:
+    receiver = SizedReceiver(20)
+    rig = Rig(receiver, 10**7)
+    rig.put(ONE * 100)
+    rig.run()
+    receiver.bytes_max = 10**6
+    for _ in range(4000):
+        rig.put(ONE * 1000)
+        while rig.run() != IDLE_NS:
+            pass
+        if len(receiver.got[-1]) >= 4500:
+            break
+    assert len(receiver.got[-1]) >= 4500
+
+
+def test_size_is_checked_before_lines_are_added() -> None:
+    fake = FakeDelivery()
+    rig = Rig(fake, 10**8)
+    lines = (b"m f=1i " + b"1" * 991 + b"\n") * 600
+    for _ in range(4):
+        rig.one.put(lines, 600, 0)
+    rig.one.put(lines * 4, 2400, 0)
+    rig.one.finish()
+    while rig.run() != IDLE_NS:
+        pass
+    assert max(map(len, fake.got)) <= BATCH_BYTES
+    assert b"".join(fake.got) == lines * 8
+    assert rig.balanced() == (4800, 4800, 0, 0)
+
+
+def test_missing_delivery_is_a_problem() -> None:
+    fake = FakeDelivery()
+    rig = Rig(fake)
+    statuses = []
+    rig.put(ONE)
+
+    def wait_for_reply() -> None:
+        for _ in range(3):
+            rig.clock.advance(5 * NS_PER_S)
+            statuses.append(rig.one.status())
+
+    fake.while_sending = wait_for_reply
+    rig.run()
+    text = "no delivery for {} s: the receiver has not confirmed a request; check the receiver"
+    assert [status.problem for status in statuses] == ["", text.format(10), text.format(15)]
+    assert [status.readers for status in statuses] == [1, 0, 0]
+    rig.run()
+    rig.clock.advance(100 * NS_PER_S)
+    assert (rig.one.status().problem, rig.one.status().readers) == ("", 1), "without lines, no delivery is due"
+
+
+def test_end_stops_the_delivery(caplog: pytest.LogCaptureFixture) -> None:
+    fake = FakeDelivery()
+    rig = Rig(fake)
+    rig.put(ONE)
+
+    def end() -> None:
+        rig.one.stop()
+        raise OSError("stopped")
+
+    fake.while_sending = end
+    assert rig.run() == IDLE_NS
+    rig.one.close()
+    assert fake.is_stopped
+    assert caplog.messages == ["influx: d: dropping 1 lines at the end"]
 
 
 def test_a_full_disk_leaves_complete_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one, real = FileDelivery(str(tmp_path / "lines"), 1000, 1), os.write
-    one.send(b"a\n")
+    one.send(b"imud_a\n")
 
     def write(descriptor: int, data: bytes) -> int:
         if len(data) < 4:
@@ -281,9 +471,9 @@ def test_a_full_disk_leaves_complete_lines(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(OSError, match="No space"):
         one.send(b"bcdef\n")
     monkeypatch.undo()
-    assert files_of(tmp_path) == {"lines": b"a\n"}
+    assert files_of(tmp_path) == {"lines": b"imud_a\n"}
     one.send(b"bcdef\n")
-    assert files_of(tmp_path) == {"lines": b"a\nbcdef\n"}
+    assert files_of(tmp_path) == {"lines": b"imud_a\nbcdef\n"}
     one.close()
 
 

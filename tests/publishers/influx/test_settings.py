@@ -1,11 +1,12 @@
 """Options of the output: invalid URLs and contradicting keys."""
 
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 
-from imud.publishers.influx.settings import InfluxOptions
+from imud.publishers.influx.settings import PUBLISHER, InfluxOptions
 
 
 @pytest.mark.parametrize(
@@ -36,3 +37,27 @@ def test_valid_urls() -> None:
         "https://db.example/api/v2/write?org=o&bucket=b&precision=ns",
     )
     assert msgspec.convert({"enabled": True, "to": {url: {} for url in urls}}, InfluxOptions).enabled
+
+
+def problem_of(*urls: str, files: int = 10) -> str:
+    options = msgspec.convert({"enabled": True, "to": {url: {"files": files} for url in urls}}, InfluxOptions)
+    return "; ".join(PUBLISHER.check(options, {}).values())
+
+
+def test_two_names_of_one_file(tmp_path: Path) -> None:
+    path = tmp_path / "lines"
+    path.write_text("")
+    (tmp_path / "hard").hardlink_to(path)
+    (tmp_path / "symbolic").symlink_to(path)
+    (tmp_path / "folder").symlink_to(tmp_path)
+    names = ["./lines", "hard", "symbolic", "folder/lines", "folder/./lines", "/lines", "lines.1", "lines.9"]
+    for name in names:
+        url = f"file://{tmp_path}/{name}"
+        assert problem_of(f"file://{path}", url).endswith("which write to the same file"), name
+        assert problem_of(url, f"file://{path}").endswith("which write to the same file"), name
+
+
+def test_different_files(tmp_path: Path) -> None:
+    path = tmp_path / "lines"
+    assert problem_of(f"file://{path}", f"file://{path}.10", f"file://{tmp_path}/other", "udp://127.0.0.1:1") == ""
+    assert problem_of(f"file://{path}", f"file://{path}.1", files=1) == ""
