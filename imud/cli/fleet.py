@@ -17,20 +17,26 @@ from imud.cli.fleet_status import DATABASE_ACTIONS, add_rejected, add_status
 from imud.cli.output import complain, table
 from imud.config import load_options
 from imud.fleet.accounts import GatewayState, StreamAccount, StreamKey
-from imud.fleet.broker import ReaderAccess
 from imud.fleet.collector import GC_ALLOCATIONS, FleetCollector, JsonLines, LedgerStore, Selection
 from imud.fleet.database.settings import CollectorSettings
 from imud.fleet.influx import InfluxStore
 from imud.fleet.messages import GatewayClock, Stream
 from imud.fleet.metrics_server import CollectorMetricsServer, FleetGauges
+from imud.fleet.paho_client import ReaderAccess
 from imud.fleet.reader import SHARES_MAX, VERSIONS, Fleet, FleetBatch
+from imud.fleet.settings import STATUS_S
 from imud.fleet.shares import FleetShares
 from imud.host.http_post import HttpPost, PostAccess, post_url
 from imud.host.installation import needs_extra
 from imud.host.log import STDERR, log_to
 from imud.host.threads import rare_garbage_collection
 from imud.model.errors import BadArgument
+from imud.model.staleness import is_stale
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
+
+ONLINE: Final = "online"
+SILENT: Final = "silent"  # the broker has the state `online`, but no message arrives
+STATUS_MOST_S: Final = 3600.0  # maximum interval of the states of a gateway, s
 
 TOP_HEAD: Final = (
     "GATEWAY",
@@ -87,9 +93,9 @@ class FleetOverview:
         for key, account in fleet.accounts.items():
             found.setdefault(key.gateway, []).append(account)
         # False sorts first: offline gateways
-        order = sorted(fleet.states, key=lambda key: (fleet.states[key].online, key))
+        order = sorted(fleet.states, key=lambda key: (self._is_online(key), key))
         rows = [self._row(key, found.get(key[1], [])) for key in order]
-        away = sum(not state.online for state in fleet.states.values())
+        away = sum(not self._is_online(key) for key in fleet.states)
         line = f"{len(rows)} gateway{'s' * (len(rows) != 1)}, {away} away" + (
             f"; {fleet.problem}" * bool(fleet.problem)
         )
@@ -100,7 +106,7 @@ class FleetOverview:
         newest_ns, error_ns = self._newest_ns.get(name), self._error_ns.get(name)
         return (
             "/".join(key),
-            "online" if state.online else state.reason or "away",
+            self._presence(key),
             str(len(state.devices)),
             f"{self._rate_hz(name):.1f}",
             str(sum(sum(one.counts.dropped.values()) for one in found)),
@@ -110,6 +116,24 @@ class FleetOverview:
             "-" if error_ns is None else f"{error_ns / NS_PER_US:.0f}",
             self._utc_text(name, state),
         )
+
+    def _is_online(self, key: tuple[str, str]) -> bool:
+        return self._presence(key) == ONLINE
+
+    def _presence(self, key: tuple[str, str]) -> str:
+        """Return whether a gateway is online. A broker stores the state of a gateway: after a power failure of both,
+        the broker still has the state `online`, and no last will."""
+        state = self._fleet.states[key]
+        if not state.online:
+            return state.reason or "away"
+        now_ns = self._now_ns()
+        arrival = self._fleet.arrivals.get(key)
+        last_ns = now_ns if arrival is None else arrival.t_ns
+        if arrival is not None and arrival.is_retained and state.clock is not None and state.clock.synchronised:
+            age_ns = self._utc_ns() - state.clock.t_ns - state.clock.utc_offset_ns
+            last_ns = min(last_ns, now_ns - age_ns)
+        period_s = min(state.status_s or STATUS_S, STATUS_MOST_S)
+        return SILENT if is_stale(last_ns, now_ns, round(period_s * NS_PER_S)) else ONLINE
 
     def _utc_text(self, name: str, state: GatewayState) -> str:
         """Format the error of a gateway's wall clock; `-` if the gateway does not report it."""

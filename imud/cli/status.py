@@ -56,7 +56,7 @@ def page(
     """Format the blocks of all devices, the problems of the outputs, and the use of the C kernel."""
     parts = [block(device) for device in devices]
     for mqtt in mqtts:
-        problems = [one for one in (mqtt.problem, mqtt.spool_problem) if one]
+        problems = [one for one in (mqtt.problem, mqtt.spool_problem, mqtt.limit) if one]
         problems += [f"the broker refuses messages of {topic}: {reason}" for topic, reason in mqtt.refused.items()]
         parts += ["\n".join(paragraph("mqtt: ", problem)) for problem in problems]
     parts += ["\n".join(paragraph(f"{name}: ", problem)) for name, problem in outputs.items()]

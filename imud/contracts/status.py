@@ -358,6 +358,9 @@ class MqttStatus(msgspec.Struct, frozen=True):
     commands_refused: int = 0  # number of rejected requests
     refused: dict[str, str] = {}  # reason for each topic that the broker refuses; imud sends all other messages
     replies_lost: int = 0  # number of discarded replies to requests: the broker refuses the topic, or too many wait
+    # Limit that changes the messages of imud, one sentence: a broker without retained messages, or a broker that sends
+    # more than imud processes; empty without a limit
+    limit: str = ""
 
 
 class RuleStatus(msgspec.Struct, frozen=True):

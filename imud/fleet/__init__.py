@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from imud.fleet.broker import ReaderAccess
+    from imud.fleet.paho_client import ReaderAccess
     from imud.fleet.reader import Fleet, FleetBatch, FleetSession
 
 __all__ = ["Fleet", "FleetBatch", "FleetSession", "ReaderAccess"]

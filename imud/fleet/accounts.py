@@ -286,6 +286,8 @@ class GatewayState(msgspec.Struct, frozen=True, kw_only=True):
     positions: list[StreamPosition] = []
     clock: GatewayClock | None = None  # wall clock; None if the gateway is offline or its version does not send it
     mqtt: dict[str, object] = {}  # counters of the output `mqtt`, as in `imud status --json`
+    # Interval of the states of the gateway, s; None if its version does not send it
+    status_s: float | None = None
 
 
 class StreamAccount(msgspec.Struct, frozen=True):

@@ -88,6 +88,8 @@ class CommandChannel:
         self.refused = 0  # number of rejected requests
         # Sends replies, called from both threads. The output sets it.
         self.answer: Callable[[CommandReply], None] = lambda _reply: None
+        # Returns whether a rejected or repeated request may get a reply. The output sets it.
+        self.may_reply: Callable[[], bool] = lambda: True
         self._settings, self._gateway, self._control = settings, gateway, control
         self._now_ns, self._utc_offset_ns = now_ns, utc_offset_ns
         self._start_ns = now_ns()
@@ -125,13 +127,18 @@ class CommandChannel:
             return
         asked = _Request(parts.device, request, topic, received.correlation)
         outcome, problem = self._check(asked)
-        if outcome is Outcome.DUPLICATE and self._repeat(asked):
-            return
-        if outcome is not None:
+        if outcome is None:
+            self._known[request.id] = self._now_ns()
+            self._asked.append(asked)
+        elif not self.may_reply():
+            self.refuse_excess()
+        elif outcome is not Outcome.DUPLICATE or not self._repeat(asked):
             self._refuse(asked, outcome, problem)
-            return
-        self._known[request.id] = self._now_ns()
-        self._asked.append(asked)
+
+    def refuse_excess(self) -> None:
+        """Count a request above the budget of the broker. imud neither runs nor answers it."""
+        with self._lock:
+            self.refused += 1
 
     def _check(self, asked: _Request) -> tuple[Outcome | None, str]:
         """Return the outcome and the cause if imud rejects a request, otherwise None."""

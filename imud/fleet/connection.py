@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, Final, NamedTuple
 
-from imud.fleet.broker import (
+from imud.fleet.broker import LOST, REFUSED, UNANSWERED, BrokerError
+from imud.fleet.paho_client import (
     CONNECT_S,
-    LOST,
-    REFUSED,
-    UNANSWERED,
+    CONNECTION_S,
     BrokerAccess,
-    BrokerError,
+    ConnectDeadline,
     close_client,
     connection_problem,
     open_client,
@@ -58,6 +57,7 @@ class ReaderConnection:
         self._answered = False
         self._awaited = 0  # number of topics without a SUBACK
         self._client: Any = None
+        self._deadline: ConnectDeadline | None = None  # None after CONNACK
         self._socket: Any = None
         # True while the socket is not read: after received messages, or because the queue is full
         self._is_paused = False
@@ -85,6 +85,7 @@ class ReaderConnection:
         try:
             await self._connect(access, client_id, session_s, is_v5=is_v5)
             await self._until(lambda: self._answered, "no answer")
+            self._remove_deadline()
             self._awaited = len(topics)
             if topics:
                 self._call_client(lambda: self._client.subscribe([(topic, 1) for topic in topics]))
@@ -109,6 +110,7 @@ class ReaderConnection:
         )  # fmt: skip
         client.max_inflight_messages_set(RECEIVE_MAX)
         self._client = client
+        self._deadline = ConnectDeadline(client, CONNECTION_S)
         await asyncio.to_thread(open_client, client, self._broker, KEEP_ALIVE_S, RECEIVE_MAX, PACKET_BYTES, session_s)
         self._socket = client.socket()
         if self._socket is None:
@@ -117,6 +119,11 @@ class ReaderConnection:
         self._descriptor = self._socket.fileno()
         asyncio.get_running_loop().add_reader(self._descriptor, self._read)
         self._check_keep_alive()
+
+    def _remove_deadline(self) -> None:
+        deadline, self._deadline = self._deadline, None
+        if deadline is not None:
+            deadline.close()
 
     @property
     def waiting(self) -> int:
@@ -144,6 +151,9 @@ class ReaderConnection:
         """Send DISCONNECT and close the connection. The broker keeps the session, unless `ends_session` (MQTT 5). A
         second call does nothing."""
         client, self._client = self._client, None
+        if self._deadline is not None:
+            self._deadline.end()  # a thread can still wait for the broker
+            self._remove_deadline()
         self._problem = self._problem or "the connection is closed"
         self._changed.set()
         for timer in (self._timer, self._pause_timer):

@@ -7,6 +7,7 @@ docs/fleet.md describes the messages. A lock file keeps other daemons from using
 
 import fcntl
 import logging
+import math
 import os
 import socket
 from collections.abc import Callable, Mapping
@@ -19,8 +20,8 @@ import msgspec
 from imud import __version__
 from imud.contracts.condition import Condition, signature
 from imud.contracts.publisher import Batch, PublisherContext
-from imud.contracts.status import DeviceStatus, MqttStatus
-from imud.fleet.broker import BrokerTurn, Connect, PahoConnection, Will, check_extra
+from imud.contracts.status import DeviceState, DeviceStatus, MqttStatus
+from imud.fleet.broker import BROKER_LIMITS, BrokerTurn, Connect, PahoConnection, Will, check_extra
 from imud.fleet.commands import CommandChannel
 from imud.fleet.messages import (
     SCHEMA,
@@ -33,7 +34,7 @@ from imud.fleet.messages import (
     topic_of,
 )
 from imud.fleet.sender import MqttSender
-from imud.fleet.settings import LOCALHOST, DeviceSending, MqttOptions, broker_of, is_name
+from imud.fleet.settings import LOCALHOST, STATUS_S, DeviceSending, MqttOptions, broker_of, is_name
 from imud.fleet.spool import Spool
 from imud.fleet.streams import Gateway, gateway_clock
 from imud.fleet.writer import SentState, SpoolWriter, WriterQueue
@@ -42,10 +43,13 @@ from imud.host.threads import BusThread, StartWorker
 from imud.model.errors import ServerError, reason_of
 from imud.model.event import Event, EventKind
 from imud.model.sample import SAMPLE_SCHEMA
+from imud.model.staleness import STALE_LEAST_NS, STALE_PERIODS, is_stale
 from imud.model.units import NS_PER_S
+from imud.model.work_budget import WorkBudget
 
 PREFIX: Final = "homeassistant"  # default prefix of the discovery topics of Home Assistant
 DEG_PER_RAD: Final = "57.29577951308232"  # 180 / π, for templates
+TEMPERATURE: Final = "temperature"  # name of an entity
 ANGLES: Final = ("roll", "pitch", "yaw")  # components of `euler_rad`
 
 
@@ -54,12 +58,36 @@ def discovery_topic(gateway: Gateway, device: str) -> str:
     return f"{PREFIX}/device/{_unique_id(gateway, device)}/config"
 
 
-def discovery_of(gateway: Gateway, status: DeviceStatus, sending: DeviceSending) -> Mapping[str, object]:
-    """Return the discovery message of a device with all entities."""
+def discovery_of(
+    gateway: Gateway, status: DeviceStatus, sending: DeviceSending, status_s: float = STATUS_S
+) -> Mapping[str, object]:
+    """Return the discovery message of a device with all entities. `status_s` is the interval of the status messages, s.
+
+    Home Assistant marks an entity as unavailable if no message arrives for three intervals, and each value of a sample
+    also while the device sends no samples.
+    """
     unique_id = _unique_id(gateway, status.name)
-    parts = _status_parts(topic_of(gateway.site, gateway.gateway, status.name, STATUS))
+    topic = topic_of(gateway.site, gateway.gateway, status.name, STATUS)
+    parts = _status_parts(topic)
+    for part in parts.values():
+        part["expire_after"] = _expiry_s(status_s)
     if sending.rate_hz and "mean" in sending.values:
-        parts |= _attitude_parts(topic_of(gateway.site, gateway.gateway, status.name, Stream.STATISTICS))
+        angles = _attitude_parts(topic_of(gateway.site, gateway.gateway, status.name, Stream.STATISTICS))
+        for part in angles.values():
+            part["expire_after"] = _expiry_s(max(sending.batch_s, 1 / sending.rate_hz))
+        parts |= angles
+
+    of_gateway = {
+        "topic": topic_of(gateway.site, gateway.gateway, "", STATE),
+        "value_template": "{{ 'online' if value_json.online else 'offline' }}",
+    }
+    of_samples = {
+        "topic": topic,
+        "value_template": f"{{{{ 'online' if value_json.state == '{DeviceState.RUNNING}' else 'offline' }}}}",
+    }
+    for name in (TEMPERATURE, *ANGLES):
+        if name in parts:
+            parts[name] |= {"availability": [of_gateway, of_samples], "availability_mode": "all"}
     identity = {
         key: status.identity[name]
         for key, name in (("model", "product"), ("serial_number", "serial_number"), ("sw_version", "firmware"))
@@ -68,15 +96,15 @@ def discovery_of(gateway: Gateway, status: DeviceStatus, sending: DeviceSending)
     return {
         "device": {"identifiers": [unique_id], "name": f"{gateway.gateway} {status.name}", **identity},
         "origin": {"name": "imud", "sw_version": __version__},
-        "availability": [
-            {
-                "topic": topic_of(gateway.site, gateway.gateway, "", STATE),
-                "value_template": "{{ 'online' if value_json.online else 'offline' }}",
-            }
-        ],
+        "availability": [of_gateway],
         "components": {name: {**part, "unique_id": f"{unique_id}_{name}"} for name, part in parts.items()},
         "qos": 1,
     }
+
+
+def _expiry_s(period_s: float) -> int:
+    """Return the time without a message after which Home Assistant marks an entity as unavailable, s."""
+    return math.ceil(max(STALE_PERIODS * period_s, STALE_LEAST_NS / NS_PER_S))
 
 
 def _unique_id(gateway: Gateway, device: str) -> str:
@@ -101,7 +129,7 @@ def _status_parts(topic: str) -> dict[str, dict[str, object]]:
             "platform": "sensor", "name": "Sample rate", "device_class": "frequency", "state_class": "measurement",
             "unit_of_measurement": "Hz", **diagnostic, "value_template": "{{ value_json.rate_hz | round(1) }}",
         },
-        "temperature": {
+        TEMPERATURE: {
             "platform": "sensor", "name": "Temperature", "device_class": "temperature", "state_class": "measurement",
             "unit_of_measurement": "°C", "state_topic": topic,
             "value_template": "{{ value_json.temperature_c | round(1) if value_json.temperature_c is number else '' }}",
@@ -131,6 +159,8 @@ log = logging.getLogger(__name__)
 LOCK: Final = "lock"
 # Minimum time between two state messages, ns. The state of one device costs the event loop 0.6 ms.
 STATE_NS: Final = NS_PER_S
+# Time without an acknowledgement while messages wait, after which it is a problem, ns
+UNDELIVERED_NS: Final = 10 * NS_PER_S
 # Events that change the state of a device
 STATE_KINDS: Final = frozenset(
     (
@@ -167,6 +197,11 @@ class MqttPublisher:
         self._settings_known: dict[str, dict[str, object]] = {}  # published settings of each device
         self._state_ns = self._all_ns = 0
         self._is_changed = True  # True after an event of STATE_KINDS
+        self._arrivals_ns: dict[str, int] = {}  # CLOCK_MONOTONIC of the newest samples of each device
+        self._stale: set[str] = set()  # devices without current samples in their published status
+        self._acknowledged = 0  # value of the sender's counter at `_delivery_ns`
+        self._delivery_ns = 0  # CLOCK_MONOTONIC of the newest acknowledgement, or since messages wait
+        self._budget = WorkBudget(BROKER_LIMITS, context.clock.cpu_ns)  # used in the thread of the sender
         self._is_first = True  # True before the first states
         self._spool_problem = self._problem = ""
         self._refused: Mapping[str, str] = {}  # reported topics that the broker refuses
@@ -197,11 +232,14 @@ class MqttPublisher:
         client_id = f"imud-{settings.site}-{gateway}"
         now_ns, utc_offset_ns = context.clock.now_ns, context.clock.utc_offset_ns
         self._sender = MqttSender(settings, client_id, will, turn, self._connect, now_ns)
+        self._sender.budget = self._budget
+        self._delivery_ns = now_ns()
         if settings.commands.enabled:
             self._commands = CommandChannel(
                 settings.commands, self._gateway, context.devices.control, now_ns, utc_offset_ns
             )
             self._commands.answer = self._sender.reply
+            self._commands.may_reply = self._sender.may_reply
             self._sender.commands = self._commands
         self._writer = SpoolWriter(settings, self._gateway, self._queue, self._spool, self._sender, context.clock)
         self._writer.start(self._start_worker)
@@ -221,6 +259,8 @@ class MqttPublisher:
         """Remove a device, and its retained messages from the broker."""
         self._names.discard(name)
         self._sent.discard(name)
+        self._arrivals_ns.pop(name, None)
+        self._stale.discard(name)
         topics = []
         if self._known.pop(name, None) is not None:
             topics += [self._topic(name, STATUS), self._topic(name, SCHEMA)]
@@ -233,6 +273,7 @@ class MqttPublisher:
 
     def publish(self, batch: Batch) -> None:
         if batch.device in self._sent:
+            self._arrivals_ns[batch.device] = self._context.clock.now_ns()
             self._queue.put_batch(batch)
 
     def event(self, event: Event) -> None:
@@ -249,6 +290,7 @@ class MqttPublisher:
         if failure is not None:
             raise failure
         self._report_problems(now_ns, writer, sender)
+        self._note_delivery(now_ns, sender)
         if self._commands is not None:
             self._commands.run_next()
             self._context.owner.tick_soon()  # a request can arrive at any time
@@ -280,18 +322,41 @@ class MqttPublisher:
         commands = self._commands
         for cause, count in (("queue", self._queue.dropped), ("disk", writer.lost_on_disk)):
             dropped[cause] = dropped.get(cause, 0) + count
+        now_ns = self._context.clock.now_ns()
+        limits = (sender.limit, self._budget.problem(now_ns))
         return MqttStatus(
-            sender.broker, sender.problem, writer.problem, self._queue.queued, spool.spooled, sender.sent,
+            sender.broker, sender.problem or self._missing_delivery(now_ns), writer.problem,
+            self._queue.queued, spool.spooled, sender.sent,
             sender.acknowledged, spool.messages, spool.used_bytes, spool.thinned, dropped, sender.reconnects,
             commands.run if commands is not None else 0, commands.refused if commands is not None else 0,
-            dict(sender.refused), sender.replies_lost,
+            dict(sender.refused), sender.replies_lost, "; ".join(filter(None, limits)),
         )  # fmt: skip
+
+    def _note_delivery(self, now_ns: int, sender: MqttSender) -> None:
+        """Store the time of the newest delivery. A refused topic has its own problem in the status."""
+        has_due = self._spool is not None and self._spool.messages > 0 and not sender.refused
+        if sender.acknowledged != self._acknowledged or not has_due:
+            self._acknowledged = sender.acknowledged
+            self._delivery_ns = now_ns
+
+    def _missing_delivery(self, now_ns: int) -> str:
+        """Return the problem if messages wait and the broker has acknowledged none for a long time."""
+        slowest_hz = self._settings.messages_per_s
+        limit_ns = UNDELIVERED_NS if slowest_hz is None else max(UNDELIVERED_NS, round(3 * NS_PER_S / slowest_hz))
+        silent_ns = now_ns - self._delivery_ns
+        if silent_ns < limit_ns or self._spool is None:
+            return ""
+        return (
+            f"no delivery for {silent_ns // NS_PER_S} s: {self._spool.messages} messages wait, and the broker has "
+            "acknowledged none; check the broker"
+        )
 
     # --- states ------------------------------------------------------------------------------------------------------
 
     def _send_states(self, now_ns: int) -> None:
         """Publish changed states of devices, and every `status_s` all states."""
         is_due = now_ns - self._all_ns >= self._settings.status_s * NS_PER_S
+        self._is_changed = self._is_changed or self._has_changed_samples(now_ns)
         if not is_due and not self._is_changed:
             return
         self._is_changed = False
@@ -308,10 +373,14 @@ class MqttPublisher:
                 other |= self._changed_settings(status)
             if not sending.status:
                 continue
+            is_without_samples = self._update_stale(status, now_ns)
             frame = status.frame
-            known = (status.state.value, status.problem, repr(frame), signature(status.condition))
+            known = (
+                status.state.value, status.problem, repr(frame), signature(status.condition), is_without_samples,
+            )  # fmt: skip
             if is_due or self._known.get(status.name) != known:
-                statuses[self._topic(status.name, STATUS)] = status
+                current = without_values(status) if is_without_samples else status
+                statuses[self._topic(status.name, STATUS)] = current
                 other[self._topic(status.name, SCHEMA)] = schema_of(status)
                 if self._settings.home_assistant:
                     other[discovery_topic(self._gateway, status.name)] = discovery_of(self._gateway, status, sending)
@@ -322,6 +391,25 @@ class MqttPublisher:
             other[self._topic("", STATE)] = state | {"mqtt": self.status(), "positions": self._positions()}
         if statuses or other:
             self._queue.put_state(SentState(statuses, other))
+
+    def _has_changed_samples(self, now_ns: int) -> bool:
+        """Return whether a device may have become stale, or sends samples again. Its status then decides."""
+        return any(
+            is_stale(arrival_ns, now_ns, 0) != (name in self._stale) for name, arrival_ns in self._arrivals_ns.items()
+        )
+
+    def _update_stale(self, status: DeviceStatus, now_ns: int) -> bool:
+        """Return whether the values in the status of a device are stale."""
+        arrival_ns = self._arrivals_ns.get(status.name)
+        if arrival_ns is None:
+            return False
+        period_ns = round(NS_PER_S / status.expected_rate_hz) if status.expected_rate_hz > 0 else 0
+        is_device_stale = is_stale(arrival_ns, now_ns, period_ns)
+        if is_device_stale:
+            self._stale.add(status.name)
+        else:
+            self._stale.discard(status.name)
+        return is_device_stale
 
     def _left_over(self) -> set[str]:
         """Return the retained topics of this gateway from earlier runs that the configuration no longer contains."""
@@ -356,6 +444,7 @@ class MqttPublisher:
         found: dict[str, object] = {"v": VERSION, "online": online, "boot": boot_text(self._context.epoch)}
         if online:
             found |= {"imud": __version__, "devices": sorted(self._sent), "clock": gateway_clock(self._context.clock)}
+            found["status_s"] = self._settings.status_s
         else:
             found["reason"] = reason
         return msgspec.json.encode(found)
@@ -412,6 +501,13 @@ class MqttPublisher:
                 f"cannot use {directory}: {reason_of(error)}; expected a directory that imud can write; "
                 f"set mqtt.spool_directory"
             ) from error
+
+
+def without_values(status: DeviceStatus) -> DeviceStatus:
+    """Return the status without the values of the newest sample, because they are stale."""
+    return msgspec.structs.replace(
+        status, rate_hz=0.0, temperature_c=None, status_bits=None, status_words=(), position=None
+    )
 
 
 def schema_of(status: DeviceStatus) -> Mapping[str, object]:

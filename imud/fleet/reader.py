@@ -35,11 +35,11 @@ from imud.fleet.accounts import (
 from imud.fleet.broker import (
     BrokerError,
     BrokerTurn,
-    ReaderAccess,
     check_extra,
 )
 from imud.fleet.connection import FleetDelivery, ReaderConnection
 from imud.fleet.messages import ROOT, STATE, FleetMessage, Stream, TopicParts, decode_message, parse_topic
+from imud.fleet.paho_client import ReaderAccess
 from imud.fleet.settings import Broker, broker_of, is_name
 from imud.model.errors import BadArgument
 from imud.model.units import NS_PER_S
@@ -104,6 +104,13 @@ def brokers_of(urls: Sequence[str]) -> list[Broker]:
     return found
 
 
+class Arrival(NamedTuple):
+    """Arrival of a message of a gateway."""
+
+    t_ns: int  # CLOCK_MONOTONIC of the reader
+    is_retained: bool  # whether the broker had stored the message: the gateway can have sent it long ago
+
+
 class Fleet:
     """Gateways of one broker or one cluster. Synchronization: one event loop."""
 
@@ -131,6 +138,8 @@ class Fleet:
         self.retry_max_s, self.now_ns = retry_max_s, now_ns
         self.ledger = FleetLedger(from_begin=from_begin)
         self.states: dict[tuple[str, str], GatewayState] = {}  # newest state of each gateway, by site and gateway
+        # Newest arrival of a message of each gateway with a state
+        self.arrivals: dict[tuple[str, str], Arrival] = {}
         self._states_bytes = 0
         self._state_bytes: dict[tuple[str, str], int] = {}  # length of each state, in the order of their arrival
         self.foreign = 0  # number of messages outside the selection
@@ -186,18 +195,27 @@ class Fleet:
             self._undecoded += 1
             log.warning("%s: %s", delivery.topic, error)
             return None
+        key = (parts.site, parts.gateway)
         if isinstance(content, GatewayState):
+            self._note_arrival(key, is_retained=delivery.retain)
             self._keep_state((parts.site, parts.gateway), content, len(delivery.payload))
             self._positions.take(parts.gateway, content)
             self.clocks.take_state(parts.gateway, content)
             for boot in (*(one.boot for one in content.positions), content.boot):
                 self._expire(BootKey(parts.gateway, boot.partition("-")[0]))
             return None
+        if key in self.states:
+            self._note_arrival(key, is_retained=False)
         stream = Stream(parts.leaf)
         fresh = self.ledger.take(content, stream)
         offset = self.clocks.take(content)
         self._expire(boot_of(content))
         return FleetBatch(parts.site, stream, fresh, offset) if fresh is not None else None
+
+    def _note_arrival(self, key: tuple[str, str], *, is_retained: bool) -> None:
+        """Store the time of a message. A retained message does not replace an earlier message of the same gateway."""
+        if not is_retained or key not in self.arrivals:
+            self.arrivals[key] = Arrival(self.now_ns(), is_retained)
 
     def _expire(self, newest: BootKey) -> None:
         """Note a message of a boot. If the boot is new, remove the old boots of its gateway from the memory."""
@@ -220,6 +238,7 @@ class Fleet:
             oldest = next(iter(self._state_bytes))
             self._states_bytes -= self._state_bytes.pop(oldest)
             del self.states[oldest]
+            self.arrivals.pop(oldest, None)
 
 
 class Share(NamedTuple):

@@ -11,26 +11,35 @@ sessions.
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import chain
 from typing import Final, NamedTuple
 
 from imud.fleet.broker import (
-    CONNECT_S,
     LOST,
     BrokerConnection,
     BrokerError,
     BrokerTurn,
     Connect,
     MessageRefused,
+    RetainRefused,
     Will,
 )
 from imud.fleet.commands import CommandChannel, CommandReply
 from imud.fleet.messages import JSON_TYPE, MAGIC, SLOTS_TYPE
-from imud.fleet.settings import MqttOptions
+from imud.fleet.paho_client import CONNECT_S
+from imud.fleet.settings import Broker, MqttOptions
 from imud.fleet.spool import SpoolRow
+from imud.fleet.topics import (
+    UNCLAIMED_NS,
+    UNCLAIMED_SKIP_NS,
+    TopicRefusals,
+    TopicSubscribers,
+    is_subscription,
+)
 from imud.host.threads import WakeEvent
 from imud.model.units import NS_PER_S
+from imud.model.work_budget import WorkBudget
 
 log = logging.getLogger(__name__)
 
@@ -48,136 +57,10 @@ UNANSWERED_S: Final = 60.0
 LINK_BYTES_S: Final = 2500.0  # bytes per second of the slowest expected link (20 kbit/s)
 
 
-# Number of lost connections in sequence with only one topic in flight, after which imud skips the topic
-LOSSES_MAX: Final = 3
-# Time for which imud skips a refused topic, ns. It doubles with each further refusal: a test can cost a connection.
-SKIP_NS: Final = 60 * NS_PER_S
-SKIP_MOST_NS: Final = 3600 * NS_PER_S
-# Maximum number of refused topics, of suspected topics, and of topics with a subscriber. imud forgets the oldest.
-TOPICS_MAX: Final = 500
-# Time for which imud keeps messages without a subscriber if their topic had a subscriber before, ns. After a restart, a
-# broker can have no subscription until the collectors connect again.
-UNCLAIMED_NS: Final = 300 * NS_PER_S
-UNCLAIMED_SKIP_NS: Final = 10 * NS_PER_S  # time between two tests of such a topic, ns
-RIGHTS: Final = "; check the access rights of the gateway"
-
-
-def is_subscription(topic: str) -> bool:
-    """Return whether a topic is the filter of the subscription. A message cannot have a topic with a wildcard."""
-    return "+" in topic
-
-
-class _Refusal(NamedTuple):
-    """Refusal of a topic."""
-
-    problem: str  # reason of the refusal, one sentence
-    skip_ns: int  # time for which imud skips the topic
-    end_ns: int  # CLOCK_MONOTONIC of the next test
-
-
-class TopicRefusals:
-    """Topics that the broker refuses, and suspected topics. Synchronization: the caller holds its lock.
-
-    The filter of the subscription is one of the topics: a broker can also refuse the subscription.
-
-    A broker refuses a message with a reason code (MQTT 5), or it closes the connection. In the second case several
-    messages can be in flight. The sender then sends the next message of each of these topics alone. A topic is refused
-    if the connection was lost LOSSES_MAX times while only messages of this topic were in flight.
-    """
-
-    def __init__(self) -> None:
-        self._suspects: dict[str, int] = {}  # number of connections that were lost while only this topic was in flight
-        self._refused: dict[str, _Refusal] = {}
-        self._skipped: dict[str, None] = {}  # refused topics whose time has not ended
-
-    @property
-    def skipped(self) -> Collection[str]:
-        """Return the topics that imud must not send now."""
-        return self._skipped.keys()
-
-    @property
-    def problems(self) -> Mapping[str, str]:
-        """Return the reason for each refused topic. The broker has not accepted a message of the topic since then."""
-        return {topic: refusal.problem for topic, refusal in self._refused.items()}
-
-    def is_suspect(self, topic: str) -> bool:
-        """Return whether a message of the topic must be the only message in flight."""
-        return topic in self._suspects
-
-    def losses(self, topic: str) -> int:
-        return self._suspects.get(topic, 0)
-
-    def refuse(self, topic: str, problem: str, now_ns: int, skip_ns: int | None = None) -> None:
-        """Skip a topic for `skip_ns`, because the broker refused a message; None: for a time that grows with each
-        refusal. Do nothing for a skipped topic."""
-        if topic in self._skipped:
-            return
-        if is_subscription(topic):
-            problem += "; commands over MQTT do not work"
-        known = self._refused.pop(topic, None)
-        if skip_ns is None:
-            skip_ns = SKIP_NS if known is None else min(2 * known.skip_ns, SKIP_MOST_NS)
-        self._suspects.pop(topic, None)
-        self._refused[topic] = _Refusal(problem, skip_ns, now_ns + skip_ns)
-        self._skipped[topic] = None
-        while len(self._refused) > TOPICS_MAX:
-            oldest = next(iter(self._refused))
-            del self._refused[oldest]
-            self._skipped.pop(oldest, None)
-
-    def accept(self, topic: str) -> None:
-        """Forget a refusal, because the broker acknowledged a message of the topic."""
-        self._suspects.pop(topic, None)
-        self._refused.pop(topic, None)
-        self._skipped.pop(topic, None)
-
-    def lose(self, in_flight: Collection[str], problem: str, now_ns: int) -> None:
-        """Suspect the topics of all messages in flight, because the connection was lost."""
-        topics = dict.fromkeys(topic for topic in in_flight if topic not in self._skipped)
-        for topic in topics:
-            losses = self._suspects.setdefault(topic, 0) + (len(topics) == 1)
-            self._suspects[topic] = losses
-            if losses >= LOSSES_MAX:
-                packet = "the subscription" if is_subscription(topic) else "a message"
-                self.refuse(topic, f"{problem}, {losses} times after {packet} of this topic{RIGHTS}", now_ns)
-        while len(self._suspects) > TOPICS_MAX:
-            del self._suspects[next(iter(self._suspects))]
-
-    def take_ended(self, now_ns: int) -> list[str]:
-        """Return the topics whose time has ended. One further loss refuses them again."""
-        ended = [topic for topic in self._skipped if self._refused[topic].end_ns <= now_ns]
-        for topic in ended:
-            del self._skipped[topic]
-            self._suspects[topic] = LOSSES_MAX - 1
-        return ended
-
-
-class TopicSubscribers:
-    """Topics that had a subscriber since the start. Synchronization: one thread."""
-
-    def __init__(self) -> None:
-        # with the time of the first message without a subscriber after that
-        self._topics: dict[str, int | None] = {}
-
-    def note(self, topic: str) -> None:
-        """Store that a message of the topic had a subscriber."""
-        self._topics.pop(topic, None)
-        self._topics[topic] = None
-        if len(self._topics) > TOPICS_MAX:
-            del self._topics[next(iter(self._topics))]
-
-    def are_expected(self, topic: str, now_ns: int) -> bool:
-        """Return whether imud keeps a message without a subscriber: for UNCLAIMED_NS after the first one, if the topic
-        had a subscriber before."""
-        if topic not in self._topics:
-            return False
-        begin_ns = self._topics[topic]
-        if begin_ns is None:
-            begin_ns = self._topics[topic] = now_ns
-        if now_ns - begin_ns > UNCLAIMED_NS:
-            del self._topics[topic]
-            return False
-        return True
+NO_RETAIN: Final = (
+    "the broker does not permit retained messages: imud sends its messages without a last will, and a reader receives "
+    "the state of a device only when imud sends it again"
+)
 
 
 class _Message(NamedTuple):
@@ -206,6 +89,9 @@ class MqttSender:
         self.problem = ""
         self.sent = 0  # number of sent messages of the spool, including repeated messages
         self.acknowledged = 0  # number of acknowledged messages of the spool
+        self.limit = ""  # part of the output that the broker does not permit, one sentence; empty without a limit
+        # Budget of the work that the packets of the broker cause. The output sets it before `start`.
+        self.budget: WorkBudget | None = None
         self.replies_lost = 0  # number of discarded replies: the broker refuses the topic, or too many wait
         self.reconnects = 0  # number of connections after the first
         self.failure: BaseException | None = None  # internal error that ended the thread
@@ -223,6 +109,7 @@ class MqttSender:
         self._answered_ns = 0  # time of the newest acknowledgement, or of the first message in flight
         self._unanswered = ""  # `problem` of missing acknowledgements
         self._has_answer = False  # whether an acknowledgement arrived after `_unanswered`
+        self._largest_bytes = 0  # length of the largest payload that a broker acknowledged, bytes
         self._refusals = TopicRefusals()
         self._subscribers = TopicSubscribers()
         self._answers: list[tuple[int, int]] = []
@@ -344,21 +231,33 @@ class MqttSender:
             else:
                 self._end_refusals()
                 self._send(connection)
+                if self.budget is not None:
+                    self.budget.start_turn(self._now_ns())
                 connection.wait(WAIT_S)
                 self._take_acknowledgements(connection)
                 self._take_requests(connection)
                 self._check_answers()
         except BrokerError as error:
             pause_s, problem = self._turn.failed(self._now_ns()), str(error)
-            if self._turn.short_runs >= SHORT_RUNS and problem.endswith(LOST):
-                problem += f"; does another gateway use the client ID {self._client_id} (mqtt.gateway)?"
-            self._disconnect(problem)
+            is_repeated = self._turn.short_runs >= SHORT_RUNS and problem.endswith(LOST)
+            self._disconnect(problem, self._loss_advice() if is_repeated else "")
             return pause_s
         return 0.0
 
+    def _loss_advice(self) -> str:
+        """Return the usual causes of repeated losses without a reason, the more probable cause first."""
+        size = max((len(message.payload) for message in self._in_flight.values()), default=0)
+        client_id = f"does another gateway use the client ID {self._client_id} (mqtt.gateway)?"
+        if size <= self._largest_bytes:
+            return f"; {client_id}"
+        return (
+            f"; does the broker accept messages of {size} bytes (largest acknowledged message: {self._largest_bytes} "
+            f"bytes)? Otherwise: {client_id}"
+        )
+
     def _open(self) -> None:
         broker = self._turn.broker
-        connection = self._connect(broker, self._settings, self._client_id, self._will, lambda: not self._ended)
+        connection = self._connect_to(broker)
         if self._ended:
             connection.close()
             return
@@ -367,12 +266,25 @@ class MqttSender:
         self._was_connected = True
         with self._lock:
             self._connection = connection
+            connection.budget = self.budget
+            self.limit = "" if connection.has_retain else NO_RETAIN
             self._due = dict.fromkeys(topic for topic in self._retained if topic not in self.skipped)
             wanted = self.commands.subscription if self.commands is not None else ""
             self._subscription = wanted if wanted not in self.skipped else ""
             self.session += 1
             self.connected, self.broker, self.problem = True, broker.name, self._unanswered
         self.wanting()
+
+    def _connect_to(self, broker: Broker) -> BrokerConnection:
+        """Connect, and without a last will if the broker does not permit retained messages. Raises BrokerError."""
+
+        def is_wanted() -> bool:
+            return not self._ended
+
+        try:
+            return self._connect(broker, self._settings, self._client_id, self._will, is_wanted)
+        except RetainRefused:
+            return self._connect(broker, self._settings, self._client_id, None, is_wanted)
 
     def _send(self, connection: BrokerConnection) -> None:
         """Send packets up to the window of the broker: subscription, replies, retained messages, then the spool."""
@@ -444,7 +356,7 @@ class MqttSender:
                 message = self._in_flight.pop(number, None)
             if message is not None:
                 self.replies_lost += message.reply is not None
-                self._refuse(message.topic, problem + RIGHTS)
+                self._refuse(message.topic, problem)
         if not connection.acknowledged:
             return
         numbers, connection.acknowledged = connection.acknowledged, []
@@ -455,6 +367,7 @@ class MqttSender:
             messages = [self._in_flight.pop(number) for number in numbers if number in self._in_flight]
             for one in messages:
                 self._refusals.accept(one.topic)
+                self._largest_bytes = max(self._largest_bytes, len(one.payload))
                 if one.is_retained and not one.payload and not self._retained.get(one.topic, b"-"):
                     del self._retained[one.topic]  # the broker removed the message
             ids = [one.row for one in messages if one.row]
@@ -544,11 +457,22 @@ class MqttSender:
     def _take_requests(self, connection: BrokerConnection) -> None:
         """Check received requests. The event loop runs them."""
         received, connection.received = connection.received, []
-        for one in received:
-            if self.commands is not None:
-                self.commands.take(one)
+        budget = self.budget
+        for message in received:
+            if self.commands is None:
+                continue
+            if budget is None or budget.admit(self.broker):
+                self.commands.take(message)
+            else:
+                self.commands.refuse_excess()
+        if budget is not None:
+            budget.end_turn()
 
-    def _disconnect(self, problem: str) -> None:
+    def may_reply(self) -> bool:
+        """Return whether the budget permits one more reply to a rejected request."""
+        return self.budget is None or self.budget.take_reply(self.broker)
+
+    def _disconnect(self, problem: str, advice: str = "") -> None:
         connection = self._connection
         if connection is not None:
             self._take_acknowledgements(connection)
@@ -556,7 +480,8 @@ class MqttSender:
         with self._lock:
             self._connection = None
             self.session += 1
-            self.connected, self.broker, self.problem = False, "", problem
+            self.connected, self.broker, self.problem = False, "", problem + advice
+            self.limit = ""
             self._outbox.clear()
             messages, self._in_flight = list(self._in_flight.values()), {}
             self._refusals.lose([one.topic for one in messages], problem, self._now_ns())

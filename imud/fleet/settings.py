@@ -17,6 +17,7 @@ from imud.model.units import NS_PER_S
 MEGABYTE: Final = 1_000_000
 BROKERS_MAX: Final = 16  # Maximum number of brokers. imud tries them in order, and more brokers would take minutes.
 EVERY: Final = "*"  # key for all devices without an entry of their own
+STATUS_S: Final = 60.0  # default interval of the status messages, s
 SET: Final = "set"  # command that changes settings; `set.NAME` allows it for one setting
 Measure = Literal["mean", "min", "max", "rms"]
 # Pattern of a name, at most 64 characters. MQTT limits a topic to 65,535 bytes, and a client ID contains three names.
@@ -179,7 +180,7 @@ class MqttOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True
     then drops the oldest messages."""
     spool_hours: Annotated[float, msgspec.Meta(ge=0.01, le=8760)] = 168.0
     """Maximum age of a message in the spool, hours."""
-    status_s: Annotated[float, msgspec.Meta(ge=1, le=3600)] = 60.0
+    status_s: Annotated[float, msgspec.Meta(ge=1, le=3600)] = STATUS_S
     """Interval of the status messages of devices and gateway, s."""
     commands: CommandOptions = CommandOptions()
     """Options of the command channel."""

@@ -8,11 +8,13 @@ import signal
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
 from imud.cli.fleet import FleetOverview
 from imud.fleet.accounts import GatewayState, StreamPosition
+from imud.fleet.connection import FleetDelivery
 from imud.fleet.messages import FleetMessage, GatewayClock, Stream
 from imud.fleet.reader import Fleet, FleetBatch
 from imud.model.units import NS_PER_S
@@ -203,3 +205,53 @@ def test_no_gateway_is_an_answer_of_no_and_the_reason_is_told(cli: Cli) -> None:
     assert "the broker connection failed at the end: mqtt://127.0.0.1:1" in printed.err
     printed = cli("fleet", "collect", "mqtt://127.0.0.1:1", "--to", "-", "--duration", "0.1s", status=1)
     assert "the broker connection failed at the end: mqtt://127.0.0.1:1" in printed.err
+
+
+class OverviewBench:
+    """Overview of one gateway that sends its state each 5 s."""
+
+    def __init__(self) -> None:
+        self.now_ns = 100 * NS_PER_S
+        self.utc_ns = 1_800_000_000 * NS_PER_S
+        self.fleet = Fleet("mqtt://broker", now_ns=lambda: self.now_ns)
+        self.overview = FleetOverview(self.fleet, lambda: self.now_ns, lambda: self.utc_ns)
+
+    def advance(self, seconds: float) -> None:
+        self.now_ns += round(seconds * NS_PER_S)
+        self.utc_ns += round(seconds * NS_PER_S)
+
+    def take_state(self, *, retain: bool, synchronised: bool = True, age_s: float = 0, **members: object) -> None:
+        clock = {"t_ns": 0, "utc_offset_ns": self.utc_ns - round(age_s * NS_PER_S), "synchronised": synchronised}
+        state = {"v": 1, "online": True, "boot": "1", "status_s": 5, "clock": clock, **members}
+        self.fleet.take(FleetDelivery("imud/mill/gw/state", json.dumps(state).encode(), retain, 1, Mock()))
+
+    @property
+    def presence(self) -> str:
+        return self.overview.text().splitlines()[1].split()[1]
+
+
+@pytest.mark.parametrize(("retain", "synchronised"), [(True, True), (True, False), (False, False)])
+def test_gateway_without_messages_is_silent(retain: bool, synchronised: bool) -> None:
+    """A broker stores the state `online` of a gateway that lost its power together with the broker."""
+    bench = OverviewBench()
+    bench.take_state(retain=retain, synchronised=synchronised)
+    assert bench.presence == "online"
+    bench.advance(15)
+    assert bench.presence == "online"
+    bench.advance(1)
+    assert bench.presence == "silent"
+    bench.take_state(retain=True, synchronised=synchronised, age_s=31)
+    assert bench.presence == "silent", "the broker sent the stored state again"
+    bench.take_state(retain=False)
+    assert bench.presence == "online"
+
+
+def test_stored_state_of_an_old_gateway_is_silent() -> None:
+    bench = OverviewBench()
+    bench.take_state(retain=True, age_s=16)
+    assert bench.presence == "silent"
+    bench = OverviewBench()
+    bench.take_state(retain=True, age_s=100, status_s=None)
+    assert bench.presence == "online", "states of an older version arrive each 60 s"
+    bench.advance(81)
+    assert bench.presence == "silent"

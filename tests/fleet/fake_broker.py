@@ -3,8 +3,9 @@
 import threading
 from collections.abc import Callable
 
-from imud.fleet.broker import BrokerError, MessageRefused, Received, Will
+from imud.fleet.broker import RIGHTS, BrokerError, MessageRefused, Received, RetainRefused, Will
 from imud.fleet.settings import Broker, MqttOptions
+from imud.model.work_budget import WorkBudget
 from tests.support.daemon_process import LIMIT_S
 
 
@@ -15,6 +16,8 @@ class FakeConnection:
         self.in_flight_max = broker.window
         self.received: list[Received] = []
         self.refused: list[tuple[int, str]] = []
+        self.has_retain = broker.has_retain
+        self.budget: WorkBudget | None = None
         self.packets: list[str] = []  # topic of each message and subscription
         self.correlations: list[bytes | None] = []
         self.sent: list[tuple[str, bytes, bool]] = []
@@ -53,7 +56,7 @@ class FakeConnection:
             if topic in self._broker.closes_on:
                 raise BrokerError("the connection was lost")
             if topic in self._broker.refuses:
-                self.refused.append((self._answered, "Not authorized"))
+                self.refused.append((self._answered, f"Not authorized{RIGHTS}"))
             elif topic not in self._broker.ignores:
                 self.acknowledged.append(self._answered)
                 if topic in self._broker.unclaimed:
@@ -87,12 +90,14 @@ class FakeBroker:
         self.ignores: set[str] = set()  # topics that the broker never acknowledges
         self.rejects: set[str] = set()  # topics whose messages are too long for the broker
         self.will: Will | None = None
+        self.permits_will = True
+        self.has_retain = True  # whether the broker permits retained messages
         self.connecting, self.accepts = threading.Event(), threading.Event()
         self.accepts.set()
         self.was_wanted = True  # result of `is_wanted` at the newest connection
 
     def connect(
-        self, broker: Broker, _settings: MqttOptions, _client_id: str, will: Will, is_wanted: Callable[[], bool]
+        self, broker: Broker, _settings: MqttOptions, _client_id: str, will: Will | None, is_wanted: Callable[[], bool]
     ) -> FakeConnection:
         """Accept or reject a connection. Wait for `accepts` first."""
         self.asked.append(broker.host)
@@ -102,6 +107,8 @@ class FakeBroker:
         self.was_wanted = is_wanted()
         if self.problem:
             raise BrokerError(self.problem)
+        if will is not None and not self.permits_will:
+            raise RetainRefused("Retain not supported")
         self.connections.append(FakeConnection(self))
         return self.connections[-1]
 

@@ -20,10 +20,21 @@ from unittest.mock import Mock
 import msgspec
 import pytest
 
-from imud.fleet import broker as fleet_broker
-from imud.fleet.broker import BrokerError, BrokerTurn, MessageRefused, PahoConnection, Will, paho_client
+from imud.fleet import paho_client as paho_client_module
+from imud.fleet.broker import (
+    BROKER_LIMITS,
+    RIGHTS,
+    BrokerError,
+    BrokerTurn,
+    MessageRefused,
+    PahoConnection,
+    RetainRefused,
+    Will,
+)
 from imud.fleet.connection import ReaderConnection
+from imud.fleet.paho_client import paho_client
 from imud.fleet.settings import Broker, MqttOptions, broker_of
+from imud.model.work_budget import WorkBudget
 from tests.fleet.authority import Authority
 from tests.fleet.mosquitto import NO_MOSQUITTO, Collector, running_broker
 from tests.support.daemon_process import LIMIT_S
@@ -130,7 +141,7 @@ def test_refused_messages_are_named(tmp_path: Path) -> None:
         number = connection.publish("imud/s/g/events", b"{}", "application/json", retain=False)
         while not connection.refused:
             connection.wait(1.0)
-        assert connection.refused == [(number, "Not authorized")]
+        assert connection.refused == [(number, f"Not authorized{RIGHTS}")]
         connection.close()
 
 
@@ -240,7 +251,7 @@ def gateway(broker: Broker) -> PahoConnection:
 
 
 async def reader(broker: Broker) -> ReaderConnection:
-    return await ReaderConnection.open(broker, fleet_broker.ReaderAccess(), "reader", ["imud/#"], 0)
+    return await ReaderConnection.open(broker, paho_client_module.ReaderAccess(), "reader", ["imud/#"], 0)
 
 
 @pytest.mark.parametrize(
@@ -286,7 +297,7 @@ def test_a_gateway_names_the_refusal(monkeypatch: pytest.MonkeyPatch) -> None:
     ended = pytest.raises(BrokerError, match="the broker ended the connection: Server shutting down")
     with scripted(CONNACK + SHUTTING_DOWN) as broker, ended, closing(gateway(broker)) as connection:
         connection.wait(LIMIT_S)
-    for reply, acknowledged, refusals in ((SUBACK, [1], []), (NO_SUBACK, [], [(1, "Not authorized")])):
+    for reply, acknowledged, refusals in ((SUBACK, [1], []), (NO_SUBACK, [], [(1, f"Not authorized{RIGHTS}")])):
         with scripted(CONNACK, reply) as broker, closing(gateway(broker)) as connection:
             assert connection.subscribe("imud/+") == 1
             connection.wait(LIMIT_S)
@@ -365,8 +376,8 @@ def test_a_file_that_cannot_be_used_is_named_with_its_key(tmp_path: Path, author
 def test_problems_and_properties() -> None:
     error = ssl.SSLCertVerificationError("certificate verify failed")
     error.verify_message = "self-signed certificate"
-    assert fleet_broker.connection_problem(error) == "self-signed certificate"
-    assert fleet_broker.properties_of("CONNECT", ReceiveMaximum=7).ReceiveMaximum == 7
+    assert paho_client_module.connection_problem(error) == "self-signed certificate"
+    assert paho_client_module.properties_of("CONNECT", ReceiveMaximum=7).ReceiveMaximum == 7
 
 
 TOPIC = b"\x00\x01t"
@@ -409,7 +420,7 @@ def test_messages_that_imud_did_not_request_end_the_connection(head: bytes) -> N
 
 
 def test_long_packets_and_websocket_frames_are_detected_in_any_pieces() -> None:
-    guard, data = fleet_broker.PacketGuard(PACKET_BYTES), b"\x32\x80\x01" + b"\x34" * 128 + b"\xd0\x00"
+    guard, data = paho_client_module.PacketGuard(PACKET_BYTES), b"\x32\x80\x01" + b"\x34" * 128 + b"\xd0\x00"
     for at in range(len(data)):
         guard.take(data[at : at + 1], is_writing=False)
     for _ in range(3):
@@ -417,12 +428,12 @@ def test_long_packets_and_websocket_frames_are_detected_in_any_pieces() -> None:
     with pytest.raises(ValueError, match="does not read"):
         guard.take(b"\xc0\x00" * (UNREAD_MAX + 1), is_writing=True)
     with pytest.raises(ValueError, match="at most 10 bytes"):
-        fleet_broker.PacketGuard(10).take(b"\x30\x0b", is_writing=False)
-    fleet_broker.PacketGuard(10).take(b"\x30\x0a", is_writing=False)
-    fleet_broker.check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES)))
-    fleet_broker.check_websocket_buffer(SimpleNamespace())  # a connection without WebSocket
+        paho_client_module.PacketGuard(10).take(b"\x30\x0b", is_writing=False)
+    paho_client_module.PacketGuard(10).take(b"\x30\x0a", is_writing=False)
+    paho_client_module.check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES)))
+    paho_client_module.check_websocket_buffer(SimpleNamespace())  # a connection without WebSocket
     with pytest.raises(ValueError, match="WebSocket frame of at most"):
-        fleet_broker.check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES + 1)))
+        paho_client_module.check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES + 1)))
 
 
 A, B = (Broker(name, 1883, False, False, "") for name in "ab")
@@ -461,3 +472,91 @@ def test_only_a_stable_connection_resets_the_pause(held_ns: int, pause_s: float)
         turn.failed(0)
     turn.connected(0)
     assert turn.failed(held_ns) == pause_s
+
+
+RETAIN_NOT_SUPPORTED = b"\x20\x03\x00\x9a\x00"
+WITHOUT_RETAIN = b"\x20\x05\x00\x00\x02\x25\x00"
+
+
+def test_refused_will_is_recognized() -> None:
+    with scripted(RETAIN_NOT_SUPPORTED) as broker, pytest.raises(RetainRefused, match="Retain not supported"):
+        gateway(broker)
+    with scripted(WITHOUT_RETAIN) as broker:
+        connection = PahoConnection(broker, MqttOptions(), "gateway", None)
+        assert not connection.has_retain
+        connection.close()
+    with scripted(WITHOUT_RETAIN) as broker, closing(gateway(broker)) as connection:
+        assert not connection.has_retain, "a broker can accept the will and permit no retained messages"
+
+
+def test_old_version_names_retained_messages() -> None:
+    with (
+        scripted(b"") as broker,
+        pytest.raises(BrokerError, match="permits retained messages and a retained last will"),
+    ):
+        PahoConnection(broker, MqttOptions(version="3.1.1"), "gateway", Will("t", b""))
+
+
+class EndingDeadline(paho_client_module.ConnectDeadline):
+    """Deadline that ends when the test requests it, without a timer."""
+
+    def __init__(self, client: object, seconds: float) -> None:
+        super().__init__(client, 1e6)
+        self._seconds = seconds
+        deadlines.append(self)
+
+
+deadlines: list[EndingDeadline] = []
+
+
+# paho-mqtt leaves the socket of a failed handshake to the garbage collector
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("scheme", ["mqtt", "mqtts", "ws"])
+def test_endless_connection_ends_at_the_deadline(scheme: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The broker accepts the connection and never completes CONNACK, TLS or the WebSocket."""
+    monkeypatch.setattr("imud.fleet.broker.ConnectDeadline", EndingDeadline)
+    deadlines.clear()
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def drip() -> None:
+            connection, _ = listener.accept()
+            with connection, suppress(OSError):
+                if scheme != "mqtt":
+                    connection.sendall(b"\x16" if scheme == "mqtts" else b"HTTP/1.1 101 S")
+                connection.recv(1)
+                deadlines[0].end()
+                while connection.recv(4096):
+                    pass
+
+        thread = threading.Thread(target=drip)
+        thread.start()
+        broker = broker_of(f"{scheme}://127.0.0.1:{listener.getsockname()[1]}")
+        assert broker is not None
+        with pytest.raises(BrokerError, match="no complete reply to the connection within 12 s"):
+            gateway(broker)
+        thread.join(LIMIT_S)
+    assert not thread.is_alive()
+
+
+def test_flood_of_packets_is_read_within_the_budget() -> None:
+    """PINGRESP packets without end: each read costs 1 ms of CPU time."""
+    cpu_ns = [0]
+
+    def cpu() -> int:
+        cpu_ns[0] += 1_000_000
+        return cpu_ns[0]
+
+    with scripted(CONNACK, b"\xd0\x00" * 5000) as broker, closing(gateway(broker)) as connection:
+        reads: list[int] = []
+        budget = WorkBudget(BROKER_LIMITS, cpu)
+        connection.budget = budget
+        connection.subscribe("imud/+")
+        for _ in range(400):
+            budget.start_turn(0)
+            before = budget.refused
+            connection.wait(1.0)
+            reads.append(budget.refused == before)
+            if budget.refused > 5:
+                break
+    assert budget.refused > 5
+    assert sum(reads) <= 4 * 200, "at most 200 ms per second"

@@ -10,8 +10,9 @@ from unittest.mock import Mock
 
 import pytest
 
-from imud.fleet.broker import BrokerError, ReaderAccess
+from imud.fleet.broker import BrokerError
 from imud.fleet.connection import ReaderConnection
+from imud.fleet.paho_client import ReaderAccess
 from imud.fleet.settings import broker_of
 from tests.fleet.authority import Authority
 from tests.fleet.fleet_gateway import SendingGateway

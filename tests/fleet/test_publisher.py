@@ -353,3 +353,50 @@ def test_slots_can_be_decoded_with_the_published_schema(tmp_path: Path) -> None:
         assert (found["accel_m_s2"], found["temperature_c"]) == (one.accel_m_s2, 20.5)
         assert not {"gyro_rad_s", "mag_t", "quat_wxyz", "euler_rad", "pressure_pa", "t_dev_ns"} & set(found)
         assert found["crc32"] == zlib.crc32(slots[at * size : at * size + 252])
+
+
+def test_status_without_current_samples_has_no_values(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path, status_s=3600)
+    topic = "imud/default/gw/imu0/status"
+    device = msgspec.structs.replace(device_status("imu0", 0), temperature_c=21.5, expected_rate_hz=0.5)
+    bench.statuses = [device]
+    bench.start()
+    bench.output.publish(Batch("imu0", 0, [sample("imu0", 1)]))
+    for _ in range(6):
+        bench.tick()
+    bench.broker.wait_for(topic, lambda payload: json.loads(payload)["temperature_c"] == 21.5)
+    for _ in range(2):
+        bench.tick()  # more than three periods of 2 s
+    bench.broker.wait_for(topic, lambda payload: json.loads(payload)["temperature_c"] is None)
+    asked = bench.asked
+    for _ in range(5):
+        bench.tick()
+    assert bench.asked == asked, "imud publishes the loss once"
+    bench.output.publish(Batch("imu0", 0, [sample("imu0", 2)]))
+    bench.tick()
+    sent = bench.close()
+    values = [json.loads(payload)["temperature_c"] for name, payload, _ in sent if name == topic]
+    assert values == [21.5, None, 21.5]
+
+
+def test_missing_acknowledgement_is_a_problem(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path, devices={"imu0": {"rate_hz": None, "whole": "json"}})
+    bench.broker.answers = 0
+    bench.start()
+    bench.output.event(Event(0, "imu0", EventKind.MARK, "pulse"))
+    for _ in range(3):
+        bench.tick()
+    assert bench.output.status().waiting == 1
+    assert "no delivery" not in bench.output.status().problem
+    bench.clock.advance(8 * NS_PER_S)
+    problem = bench.output.status().problem
+    assert "no delivery for 10 s: 1 messages wait" in problem or "expected an acknowledgement" in problem
+    bench.close()
+
+
+def test_state_contains_its_interval(tmp_path: Path) -> None:
+    bench = PublisherBench(tmp_path, status_s=5)
+    bench.start()
+    bench.tick()
+    bench.broker.wait_for("imud/default/gw/state", lambda payload: json.loads(payload).get("status_s") == 5.0)
+    bench.close()

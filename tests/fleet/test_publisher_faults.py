@@ -89,7 +89,7 @@ def test_a_frozen_broker_is_replaced_without_loss(tmp_path: Path, broker: Mosqui
 
 
 def test_refused_messages_are_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("imud.fleet.sender.SKIP_NS", 1)
+    monkeypatch.setattr("imud.fleet.topics.SKIP_NS", 1)
     rights = tmp_path / "rights"
     rights.write_text("topic read #\ntopic write imud/default/gw/state\n")
     port = free_port()

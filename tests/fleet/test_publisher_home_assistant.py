@@ -88,6 +88,31 @@ def test_values_are_rendered() -> None:
     assert rendered(template, b'{"kind": "dropped", "first": 1}') == ""
 
 
+def test_entities_expire() -> None:
+    made = discovery_of(GATEWAY, status(), DeviceSending(rate_hz=0.5, batch_s=1.0), 20.0)
+    components = json.loads(msgspec.json.encode(made))["components"]
+    # three intervals of the state messages, and of the statistics
+    assert {name: part["expire_after"] for name, part in components.items()} == {
+        "condition": 60, "problem": 60, "rate": 60, "temperature": 60, "roll": 6, "pitch": 6, "yaw": 6,
+    }  # fmt: skip
+    made = discovery_of(GATEWAY, status(), DeviceSending(rate_hz=100.0, batch_s=0.1))
+    assert json.loads(msgspec.json.encode(made))["components"]["roll"]["expire_after"] == 1
+
+
+@pytest.mark.parametrize(("state", "availability"), [(state, state == "running") for state in DeviceState])
+def test_values_are_unavailable_without_samples(state: DeviceState, availability: bool) -> None:
+    components = json.loads(msgspec.json.encode(discovery_of(GATEWAY, status(), DeviceSending())))["components"]
+    payload = msgspec.json.encode(status(state=state))
+    for name in ("temperature", "roll", "pitch", "yaw"):
+        assert components[name]["availability_mode"] == "all"
+        of_gateway, of_samples = components[name]["availability"]
+        assert of_gateway["topic"] == "imud/mill/gw-17/state"
+        assert of_samples["topic"] == "imud/mill/gw-17/bow/status"
+        assert rendered(of_samples["value_template"], payload) == ("online" if availability else "offline")
+    for name in ("condition", "problem", "rate"):
+        assert "availability" not in components[name], "the state of a device without samples is current"
+
+
 @pytest.mark.live
 def test_availability_follows_birth_and_last_will(tmp_path: Path) -> None:
     bench = PublisherBench(tmp_path, home_assistant=True)

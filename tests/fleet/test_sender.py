@@ -5,14 +5,16 @@ from unittest.mock import Mock
 
 import pytest
 
-from imud.fleet.broker import LOST, BrokerTurn, Will
+from imud.fleet.broker import BROKER_LIMITS, LOST, BrokerTurn, Received, Will
 from imud.fleet.commands import CommandChannel, CommandReply
 from imud.fleet.messages import JSON_TYPE, MAGIC, SLOTS_TYPE
-from imud.fleet.sender import SKIP_NS, TOPICS_MAX, UNCLAIMED_NS, UNCLAIMED_SKIP_NS, MqttSender, TopicRefusals
+from imud.fleet.sender import NO_RETAIN, MqttSender
 from imud.fleet.settings import Broker, CommandOptions, MqttOptions
 from imud.fleet.spool import SpoolRow
 from imud.fleet.streams import Gateway
+from imud.fleet.topics import SKIP_NS, TOPICS_MAX, UNCLAIMED_NS, UNCLAIMED_SKIP_NS, TopicRefusals
 from imud.model.units import NS_PER_S
+from imud.model.work_budget import WorkBudget
 from tests.fleet.fake_broker import FakeBroker
 from tests.support.daemon_process import LIMIT_S
 from tests.support.event_loops import VirtualClock
@@ -256,7 +258,7 @@ def test_one_missing_acknowledgement_among_others_is_named(topic: str, words: st
 
 @pytest.mark.parametrize("way", ["closes_on", "refuses", "rejects"])
 def test_forbidden_topics_do_not_block_other_messages(way: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("imud.fleet.sender.SKIP_NS", LONG_NS)
+    monkeypatch.setattr("imud.fleet.topics.SKIP_NS", LONG_NS)
     bench = SenderBench()
     bench.sender.commands = CommandChannel(CommandOptions(), Gateway("s", "gw", ""), Mock(), bench.clock.now_ns, Mock())
     forbidden = FORBIDDEN if way == "rejects" else FORBIDDEN | {REQUESTS}
@@ -389,3 +391,82 @@ def test_the_number_of_topics_with_a_subscriber_is_limited() -> None:
     bench.drive(2)
     assert bench.sender.refused.keys() == {"data/1"}, "imud has forgotten the oldest topic"
     assert bench.done >= {1001}
+
+
+def test_broker_without_retained_messages() -> None:
+    bench = SenderBench()
+    bench.broker.permits_will = False
+    bench.broker.has_retain = False
+    bench.sender.retain({"state": b"on"})
+    bench.drive(3, [row(1)])
+    assert bench.broker.will is None
+    assert bench.broker.asked == ["a", "a"], "the second connection has no last will"
+    assert (bench.sender.connected, bench.sender.problem, bench.sender.limit) == (True, "", NO_RETAIN)
+    assert bench.done == {1}
+    bench.broker.permits_will = bench.broker.has_retain = True
+    bench.broker.problem = "lost"
+    bench.drive(1)
+    assert bench.sender.limit == ""
+    bench.broker.problem = ""
+    bench.drive(3)
+    assert bench.broker.will == Will("state", b"gone"), "imud tries the last will at each connection"
+    assert bench.sender.limit == ""
+
+
+def test_large_message_names_the_size_limit_first() -> None:
+    bench = SenderBench()
+    bench.drive(2, [row(1, bytes(100))])
+    bench.broker.closes_on = {"large"}
+    rows = [row(number, bytes(5000), "large") for number in (2, 3, 4, 5)]
+    problems = []
+    for _ in range(12):
+        bench.drive(1, rows)
+        problems.append(bench.sender.problem)
+    advice = "does the broker accept messages of 5000 bytes (largest acknowledged message: 100 bytes)? Otherwise: does"
+    named = [problem for problem in problems if "client ID" in problem]
+    assert named
+    assert all(advice in problem for problem in named)
+    assert bench.sender.refused == {
+        "large": "the connection was lost, 3 times after a message of this topic; check the access rights of the "
+        "gateway, and the size limit of the broker"
+    }
+
+
+def test_flood_of_requests_stays_within_the_budget() -> None:
+    """The dearest requests: valid ones above `per_minute`, which get a reply each, and each costs 1 ms."""
+    bench = SenderBench()
+    cpu_ns = [0]
+    budget = WorkBudget(BROKER_LIMITS, lambda: cpu_ns[0])
+    bench.sender.budget = budget
+    options = CommandOptions(enabled=True, actions=["save"], per_minute=1)
+    utc_ns = 1_800_000_000 * NS_PER_S
+    channel = CommandChannel(options, Gateway("s", "g", "1"), Mock(), bench.clock.now_ns, lambda: utc_ns)
+    replies: list[CommandReply] = []
+    channel.answer = replies.append
+    channel.may_reply = bench.sender.may_reply
+    bench.sender.commands = channel
+    bench.drive(1)
+    connection = bench.broker.connections[0]
+    checked = 0
+
+    def take_one(received: Received) -> None:
+        nonlocal checked
+        checked += 1
+        cpu_ns[0] += 1_000_000
+        channel.take(received)
+
+    bench.sender.commands = Mock(wraps=channel)
+    bench.sender.commands.take = take_one
+    number = 0
+    for _ in range(10):  # turns within one second
+        for _ in range(100):
+            number += 1
+            issued_ns = bench.clock.now_ns() + utc_ns
+            payload = f'{{"v":1,"id":"{number}","issued_utc_ns":{issued_ns},"action":"save","arguments":{{}}}}'
+            connection.received.append(Received("imud/s/g/bow/command", payload.encode(), False, "", None))
+        bench.drive(1)
+    assert checked <= 10 * 3, "2 ms of CPU time in each turn"
+    assert len(replies) <= 20 + 20, "20 replies per second"
+    assert channel.refused == 1000 - 1
+    assert budget.refused >= 1000 - checked
+    assert "sends more than imud processes" in budget.problem(bench.clock.now_ns())

@@ -548,7 +548,10 @@ def _gauge_of(name: str, unit: Unit, words: str, read: Callable[[MqttStatus], fl
 
 
 MQTT_FAMILIES: Final = (
-    _gauge_of("connected", NO_UNIT, "1 if a broker is connected, otherwise 0.", lambda status: bool(status.broker)),
+    _gauge_of(
+        "connected", NO_UNIT, "1 if a broker is connected and acknowledges messages, otherwise 0.",
+        lambda status: bool(status.broker) and not status.problem,
+    ),
     _gauge_of(
         "spooling", NO_UNIT, "1 if imud can write the spool, 0 if the disk is full or fails.",
         lambda status: not status.spool_problem,
