@@ -33,6 +33,7 @@ from imud.formats.ring import (
     LEDGER_BLOCK_BYTES,
     LEDGER_BLOCK_OFFSET,
     LEDGER_UPDATE_WORD,
+    MAGIC,
     NEWEST_WORD,
     OFFSETS,
     OPEN_FLAGS,
@@ -47,7 +48,7 @@ from imud.formats.ring import (
     ring_path,
 )
 from imud.formats.slot import SEQ_INVALID, SLOT_BYTES, slot_seqs, slots_in
-from imud.host.files import can_replace, user_name
+from imud.host.files import READ_FLAGS, can_replace, user_name
 from imud.model.errors import ServerError
 from imud.model.options import Options
 from imud.model.units import NS_PER_MS
@@ -112,6 +113,29 @@ class RingDirectory:
                 raise ServerError(f"{path}: another imud writes this ring, {_process(descriptor)}: stop it first")
         finally:
             os.close(descriptor)
+
+    def keep_foreign_file(self, name: str) -> None:
+        """Rename a file of this user or of root that has the name of a ring and is not a ring: imud replaces the name,
+        and the content stays."""
+        try:
+            status = os.stat(name, dir_fd=self._fd, follow_symlinks=False)
+            if not _credible(status) or not status.st_size:
+                return
+            descriptor = os.open(name, READ_FLAGS | os.O_NOFOLLOW, dir_fd=self._fd)
+        except OSError:
+            return
+        try:
+            start = os.pread(descriptor, len(MAGIC), 0)
+        finally:
+            os.close(descriptor)
+        if start == MAGIC:
+            return
+
+        new_name = f".{name}.{secrets.token_hex(8)}.foreign"
+        with suppress(OSError):
+            os.rename(name, new_name, src_dir_fd=self._fd, dst_dir_fd=self._fd)
+            path = os.path.join(self.path, name)
+            log.warning("shm: %s is not a ring of imud; renamed it to %s in the same directory", path, new_name)
 
     def make(self, name: str, size_bytes: int, head: bytes, mode: int, group_id: int | None) -> int:
         """Create the file `name` with `head` and zeros. Return its locked descriptor.
@@ -486,7 +510,9 @@ class ShmPublisher:
         self.remove_device(name)
         try:
             directory = self._opened_directory()
-            directory.refuse_second_writer(ring_path(directory.path, name).name)
+            file_name = ring_path(directory.path, name).name
+            directory.refuse_second_writer(file_name)
+            directory.keep_foreign_file(file_name)
         except ServerError:
             if not self._started:  # the daemon will not start: close all rings
                 self.close()
@@ -572,7 +598,9 @@ class ShmPublisher:
         old = self._rings.get(name)
         if old is None or not old.is_named(directory):
             try:
-                directory.refuse_second_writer(ring_path(directory.path, name).name)
+                file_name = ring_path(directory.path, name).name
+                directory.refuse_second_writer(file_name)
+                directory.keep_foreign_file(file_name)
             except ServerError as error:
                 self._put_off(name, error)
                 return

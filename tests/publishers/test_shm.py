@@ -457,3 +457,18 @@ def test_group_and_mode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     publisher.add_device("a", 0)
     assert (given, stat.S_IMODE((tmp_path / "imud.a").stat().st_mode)) == ([(-1, os.getegid())], 0o604)
     publisher.close()
+
+
+@pytest.mark.parametrize("content", [b"notes of the user\n", bytes(1 << 16), layout.MAGIC[:-1]])
+def test_foreign_file_is_kept(tmp_path: Path, content: bytes) -> None:
+    """A file of this user that has the name of a ring keeps its content under another name."""
+    path = tmp_path / f"imud.{DEVICE}"
+    path.write_bytes(content)
+    board = Board(tmp_path)
+    assert path.read_bytes().startswith(layout.MAGIC)
+    path.unlink()
+    path.write_bytes(content)
+    board.tick(NS_PER_S)
+    assert path.read_bytes().startswith(layout.MAGIC)
+    board.publisher.close()
+    assert [file.read_bytes() for file in tmp_path.glob(".imud.*.foreign")] == [content] * 2
