@@ -15,7 +15,7 @@ import pytest
 from imud.host.network import interface_addresses, listen, resolve
 from imud.host.scrape_server import HttpRequest, HttpResponse, ScrapeServer
 from imud.model.errors import ServerError
-from imud.publishers.nmea0183 import TcpOutput, UdpOutput
+from imud.publishers.sentence_ports import TcpOutput, UdpOutput
 from imud.utc.receivers import GpsdSource, RmcOptions
 from tests.support.daemon_process import LIMIT_S
 from tests.support.event_loops import VirtualClock, in_loop

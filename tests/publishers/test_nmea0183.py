@@ -29,8 +29,9 @@ from imud.model.errors import ServerError
 from imud.model.options import wrong_values
 from imud.model.sample import Sample, Sync, Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S
-from imud.publishers import nmea0183, vessel
-from imud.publishers.nmea0183 import open_serial as open_real_port
+from imud.model.work_budget import WorkBudget
+from imud.publishers import nmea0183, sentence_ports, vessel
+from imud.publishers.sentence_ports import open_serial as open_real_port
 from tests.support.event_loops import VirtualClock, in_loop
 from tests.support.publisher_context import FakeLatencies, publisher_context
 from tests.support.socket_rig import device_status, in_context
@@ -392,7 +393,7 @@ async def until(condition: Callable[[], bool]) -> None:
             await asyncio.sleep(0)
 
 
-class Server(nmea0183.TcpOutput):
+class Server(sentence_ports.TcpOutput):
     def __init__(self) -> None:
         self.clock, self.clients = VirtualClock(), list[socket.socket]()
         super().__init__("127.0.0.1", 0, self.clock.now_ns)
@@ -441,7 +442,7 @@ async def test_every_client_gets_every_sentence(made: Server) -> None:
         assert first.recv(100) == ONE
     assert made.status().readers == 1
     with pytest.raises(ServerError, match=r"nmea0183\.tcp_port"):
-        nmea0183.TcpOutput("127.0.0.1", made.port, VirtualClock().now_ns).open()
+        sentence_ports.TcpOutput("127.0.0.1", made.port, VirtualClock().now_ns).open()
 
 
 @in_context("made", serving)
@@ -497,17 +498,96 @@ async def test_a_client_that_does_not_read_loses_complete_sentences_and_is_disco
     assert bytes(got) == BUSY * status.sent
     for _ in range(200):
         made.put(BUSY)
-    made.clock.advance(STUCK_NS)
+    made.clock.advance(10 * NS_PER_S - 1)
+    assert (made.status().readers, made.status().problem) == (1, "")
+    made.clock.advance(1)
+    status = made.status()
+    assert status.readers == 0
+    assert "has not read for 10 s" in status.problem
+    made.clock.advance(STUCK_NS - 10 * NS_PER_S)
     made.tick(made.clock.now_ns())
-    assert made.status().readers == 1
+    assert "has not read for 30 s" in made.status().problem
     made.clock.advance(1)
     made.tick(made.clock.now_ns())
-    assert made.status().readers == 0
+    assert (made.status().readers, made.status().problem) == (0, "")
+
+
+class BudgetedServer(Server):
+    """Server on which each read and each connection costs 1 ms of CPU time."""
+
+    def __init__(self) -> None:
+        self.cpu_ns = 0
+        super().__init__()
+        self._budget = WorkBudget(sentence_ports.PEER_LIMITS, self.take_cpu_ns)
+
+    def take_cpu_ns(self) -> int:
+        self.cpu_ns += 1_000_000
+        return self.cpu_ns
+
+
+@asynccontextmanager
+async def budgeted(_folder: Path) -> AsyncIterator[BudgetedServer]:
+    made = BudgetedServer()
+    yield made
+    for client in made.clients:
+        client.close()
+    made.close()
+
+
+@in_context("made", budgeted)
+async def test_data_of_clients_stay_within_the_budget(made: BudgetedServer) -> None:
+    """A client sends data without end: imud reads at most 20 ms per second, and then leaves the data in the kernel."""
+    flooding = await made.connected()
+    flooding.setblocking(False)
+    for _ in range(2000):
+        with suppress(BlockingIOError):
+            flooding.send(bytes(65_536))
+        await asyncio.sleep(0)
+    assert made.cpu_ns <= (20 + 20) * 3 * 1_000_000, "three readings of the clock for each read"
+    assert "127.0.0.1 sends more than imud processes" in made.status().problem
+    assert made.status().discarded >= 1
+    made.put(ONE)
+    assert flooding.recv(100) == ONE, "the client still gets sentences"
+    used_ns = made.cpu_ns
+    made.clock.advance(NS_PER_S)
+    made.tick(made.clock.now_ns())
+    await until(lambda: made.cpu_ns > used_ns)
+
+
+@in_context("made", budgeted)
+async def test_connections_stay_within_the_budget(made: BudgetedServer) -> None:
+    for _ in range(100):
+        made.connect().close()
+        await asyncio.sleep(0)
+    assert made.cpu_ns <= (20 + 2 * 20) * 3 * 1_000_000
+    made.clock.advance(NS_PER_S)
+    made.tick(made.clock.now_ns())
+    for _ in range(20):
+        await asyncio.sleep(0)
+    assert made.status().discarded >= 1
+
+
+def test_serial_port_without_progress_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = VirtualClock()
+    made = sentence_ports.SerialOutput("/dev/ttyUSB9", 38400, clock.now_ns)
+    master, slave = os.openpty()
+    os.set_blocking(slave, False)
+    monkeypatch.setattr(made, "_fd", slave)
+    monkeypatch.setattr(made, "_problem", "")
+    for _ in range(2000):
+        made.put(BUSY)
+    assert (made.status().readers, made.status().problem) == (1, "")
+    clock.advance(10 * NS_PER_S)
+    assert (made.status().readers, made.status().problem) == (
+        0, "the port has accepted no data for 10 s; check its flow control",
+    )  # fmt: skip
+    made.close()
+    os.close(master)
 
 
 def test_the_rest_of_a_sentence_precedes_the_next_sentence() -> None:
     send = Mock(side_effect=lambda data: min(len(data), 5))
-    client = nmea0183.TcpClient(Mock(send=send), "")
+    client = sentence_ports.TcpClient(Mock(send=send), "")
     assert [client.put(ONE, 0) for _ in range(8)] == [True, False, False, True, False, False, True, False]
     assert b"".join(one.args[0][:5] for one in send.mock_calls).startswith(ONE * 2)
 
@@ -544,7 +624,7 @@ def test_datagrams_to_a_host_and_to_all(address: str) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind((address, 0))
         receiver.settimeout(LIMIT_S)
-        made = nmea0183.UdpOutput(address, receiver.getsockname()[1])
+        made = sentence_ports.UdpOutput(address, receiver.getsockname()[1])
         made.put(ONE * 3)
         assert receiver.recv(1000) == ONE * 3
         assert (made.status().sent, made.status().dropped, made.status().readers) == (3, 0, 1)
@@ -552,7 +632,7 @@ def test_datagrams_to_a_host_and_to_all(address: str) -> None:
 
 
 def test_datagrams_without_a_route_are_counted_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
-    made = nmea0183.UdpOutput("127.0.0.1", 9)
+    made = sentence_ports.UdpOutput("127.0.0.1", 9)
     for dropped in (1, 2):
         made.put(ONE + b"x" * 70_000)  # longer than the maximum of a datagram
         assert (made.status().dropped, made.status().readers) == (dropped, 0)
@@ -580,7 +660,7 @@ async def test_the_pause_between_attempts_to_open_a_port_grows_to_30_s() -> None
         tried_s.append(clock.now_ns() / NS_PER_S)
         raise FileNotFoundError(2, "No such file or directory")
 
-    made = nmea0183.SerialOutput("/dev/ttyUSB9", 38400, clock.now_ns, fail)
+    made = sentence_ports.SerialOutput("/dev/ttyUSB9", 38400, clock.now_ns, fail)
     begin_s = clock.now_ns() / NS_PER_S
     for _ in range(100):
         made.tick(clock.now_ns())
@@ -600,7 +680,7 @@ async def test_a_lost_serial_port_is_opened_again() -> None:
             raise FileNotFoundError(2, "No such file or directory")
         return open_real_port(ports[0].path, baud)
 
-    made = nmea0183.SerialOutput("/dev/ttyUSB9", 38400, clock.now_ns, open_port)
+    made = sentence_ports.SerialOutput("/dev/ttyUSB9", 38400, clock.now_ns, open_port)
     made.put(ONE)
     made.tick(clock.now_ns())
     await until(lambda: made.status().problem == "No such file or directory")
@@ -630,7 +710,7 @@ async def test_a_lost_serial_port_is_opened_again() -> None:
 @in_loop
 async def test_a_serial_port_finishes_a_sentence_before_the_next() -> None:
     clock, (reader, writer) = VirtualClock(), os.pipe2(os.O_NONBLOCK)
-    made = nmea0183.SerialOutput("/dev/ttyUSB9", 4800, clock.now_ns, lambda *_: writer)
+    made = sentence_ports.SerialOutput("/dev/ttyUSB9", 4800, clock.now_ns, lambda *_: writer)
     made.tick(clock.now_ns())
     await until(lambda: made.status().readers == 1)
     made.put(2 * BUSY)  # a pipe has room for 65,536 bytes
@@ -651,7 +731,7 @@ async def test_a_serial_port_finishes_a_sentence_before_the_next() -> None:
 @in_loop
 async def test_a_full_serial_port_drops_complete_sentences() -> None:
     clock, port = VirtualClock(), Port()
-    made = nmea0183.SerialOutput(port.path, 4800, clock.now_ns)
+    made = sentence_ports.SerialOutput(port.path, 4800, clock.now_ns)
     made.tick(clock.now_ns())
     await until(lambda: made.status().readers == 1)
     sentence = b"$" + b"y" * 60 + b"\r\n"
@@ -677,7 +757,7 @@ async def test_a_port_opened_after_the_end_is_closed() -> None:
         fds.append(open_real_port(path, baud))
         return fds[0]
 
-    made = nmea0183.SerialOutput(port.path, 4800, clock.now_ns, open_port)
+    made = sentence_ports.SerialOutput(port.path, 4800, clock.now_ns, open_port)
     made.tick(clock.now_ns())
     made.close()
 

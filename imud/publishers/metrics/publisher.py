@@ -33,6 +33,7 @@ from imud.host.scrape_server import HttpRequest, HttpResponse, ScrapeServer, enc
 from imud.model.event import Event
 from imud.model.options import Options, is_ip_address, shown
 from imud.model.units import NS_PER_S
+from imud.model.work_budget import WorkBudget, WorkLimits
 from imud.publishers.metrics.families import (
     FAMILIES,
     FLIGHT_FAMILIES,
@@ -55,6 +56,10 @@ PAUSE_S: Final = 100e-6
 SAMPLES_PER_TURN: Final = 64  # Number of lines rendered without a pause. One line costs about 4 us.
 
 DEVICES_PER_TURN: Final = 8  # number of devices whose status the event loop reads in one turn, about 0.3 ms
+# CPU time of all scrapers per second in the HTTP thread. Above it, a scraper gets the newest page again: a page of one
+# device costs about 10 ms, and Prometheus reads a page every 15 s.
+SCRAPE_LIMITS: Final = WorkLimits(second_cpu_ns=200_000_000)
+SCRAPERS: Final = "scrapers"  # peer of the budget: a snapshot serves all waiting scrapers together
 JSON: Final = "application/json"
 ABOUT: Final = b"imud: metrics for Prometheus are at /metrics\n"
 
@@ -189,6 +194,8 @@ class MetricsPublisher:
         # held in the HTTP thread: 32 snapshots at once would need one long turn of the daemon's event loop
         self._turn = asyncio.Lock()
         self._pages: dict[str, asyncio.Task[HttpResponse]] = {}  # tasks that wait for a snapshot, by content type
+        self._newest: dict[str, HttpResponse] = {}  # newest page by content type
+        self._budget = WorkBudget(SCRAPE_LIMITS, context.clock.cpu_ns)  # used in the HTTP thread
 
     @property
     def port(self) -> int:
@@ -245,6 +252,8 @@ class MetricsPublisher:
         clients that no longer wait, and each would need a snapshot."""
         content_type = encoder_for(accept)[1]
         page = self._pages.get(content_type)
+        if page is None and content_type in self._newest and not self._may_scrape():
+            return self._newest[content_type]
         if page is None:
             page = self._pages[content_type] = asyncio.create_task(self._scrape(accept, content_type))
         return await asyncio.shield(page)
@@ -260,8 +269,17 @@ class MetricsPublisher:
             finally:
                 del self._pages[content_type]
             newest = {device.name: device.newest_seq for device in snapshot.devices}
+            self._may_scrape()
             views = self._rings.read(snapshot.rings, newest, self._scraped_ns)
-            return self._renderer.render(replace(snapshot, views=views), accept)
+            page = self._renderer.render(replace(snapshot, views=views), accept)
+            self._budget.end_turn()
+            self._newest[content_type] = page
+            return page
+
+    def _may_scrape(self) -> bool:
+        """Return whether the budget of all scrapers permits a new page. Charge the work that follows to it."""
+        self._budget.start_turn(self._scraped_ns)
+        return self._budget.admit(SCRAPERS)
 
     async def _ask_loop(self) -> Snapshot:
         """Return a snapshot from the event loop. Raises TimeoutError if the loop is blocked or has ended."""

@@ -239,3 +239,26 @@ def test_the_address_is_checked() -> None:
     assert MetricsOptions(address="localhost").address == "localhost"
     with pytest.raises(ValueError, match=r'expected an IP address such as 127\.0\.0\.1 or ::1, got "front\.example"'):
         MetricsOptions(address="front.example")
+
+
+@in_loop
+async def test_flood_of_scrapes_gets_the_newest_page() -> None:
+    """Each page costs 20 ms of CPU time. A flood makes at most 10 pages per second."""
+    seen: list[int] = []
+    renderer_cpu_ns = [0]
+
+    def take_cpu_ns() -> int:
+        renderer_cpu_ns[0] += 20_000_000
+        return renderer_cpu_ns[0]
+
+    def status() -> Sequence[DeviceStatus]:
+        seen.append(len(seen))
+        return DEVICES
+
+    flooded = context(status)
+    clock = replace(flooded.clock, cpu_ns=take_cpu_ns)
+    async with publisher(replace(flooded, clock=clock)) as served:
+        for _ in range(100):
+            line, _, _ = await ask(served.port)
+            assert line == "HTTP/1.1 200 OK"
+    assert len(seen) <= 11
