@@ -63,7 +63,7 @@ class FleetOverview:
         """`now_ns`: CLOCK_MONOTONIC; `utc_ns`: CLOCK_REALTIME."""
         self._fleet = fleet
         self._now_ns, self._utc_ns = now_ns, utc_ns
-        # Arrival time and number of received samples, by gateway and stream
+        # GatewayArrival time and number of received samples, by gateway and stream
         self._counts: dict[tuple[str, Stream], deque[tuple[int, int]]] = {}
         self._newest_ns: dict[str, int] = {}
         self._error_ns: dict[str, int] = {}

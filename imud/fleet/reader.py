@@ -104,8 +104,8 @@ def brokers_of(urls: Sequence[str]) -> list[Broker]:
     return found
 
 
-class Arrival(NamedTuple):
-    """Arrival of a message of a gateway."""
+class GatewayArrival(NamedTuple):
+    """GatewayArrival of a message of a gateway."""
 
     t_ns: int  # CLOCK_MONOTONIC of the reader
     is_retained: bool  # whether the broker had stored the message: the gateway can have sent it long ago
@@ -139,7 +139,7 @@ class Fleet:
         self.ledger = FleetLedger(from_begin=from_begin)
         self.states: dict[tuple[str, str], GatewayState] = {}  # newest state of each gateway, by site and gateway
         # Newest arrival of a message of each gateway with a state
-        self.arrivals: dict[tuple[str, str], Arrival] = {}
+        self.arrivals: dict[tuple[str, str], GatewayArrival] = {}
         self._states_bytes = 0
         self._state_bytes: dict[tuple[str, str], int] = {}  # length of each state, in the order of their arrival
         self.foreign = 0  # number of messages outside the selection
@@ -215,7 +215,7 @@ class Fleet:
     def _note_arrival(self, key: tuple[str, str], *, is_retained: bool) -> None:
         """Store the time of a message. A retained message does not replace an earlier message of the same gateway."""
         if not is_retained or key not in self.arrivals:
-            self.arrivals[key] = Arrival(self.now_ns(), is_retained)
+            self.arrivals[key] = GatewayArrival(self.now_ns(), is_retained)
 
     def _expire(self, newest: BootKey) -> None:
         """Note a message of a boot. If the boot is new, remove the old boots of its gateway from the memory."""

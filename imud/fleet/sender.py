@@ -22,6 +22,7 @@ from imud.fleet.broker import (
     BrokerTurn,
     Connect,
     MessageRefused,
+    Received,
     RetainRefused,
     Will,
 )
@@ -72,6 +73,51 @@ class _Message(NamedTuple):
     reply: CommandReply | None = None  # reply to a request
     is_retained: bool = False
     due_ns: int = 0  # time of the acknowledgement at the latest, for a message in flight
+
+
+def connect_to(
+    connect: Connect, arguments: tuple[Broker, MqttOptions, str], will: Will, is_wanted: Callable[[], bool]
+) -> BrokerConnection:
+    """Connect, and without a last will if the broker does not permit retained messages. Raises BrokerError."""
+    try:
+        return connect(*arguments, will, is_wanted)
+    except RetainRefused:
+        return connect(*arguments, None, is_wanted)
+
+
+def loss_advice(client_id: str, size: int, largest_bytes: int) -> str:
+    """Return the usual causes of repeated losses without a reason, the more probable cause first. `size` is the length
+    of the largest message in flight, and `largest_bytes` of the largest acknowledged message, bytes."""
+    other_client = f"does another gateway use the client ID {client_id} (mqtt.gateway)?"
+    if size <= largest_bytes:
+        return f"; {other_client}"
+    return (
+        f"; does the broker accept messages of {size} bytes (largest acknowledged message: {largest_bytes} bytes)? "
+        f"Otherwise: {other_client}"
+    )
+
+
+def take_requests(commands: CommandChannel, received: list[Received], budget: WorkBudget | None, broker: str) -> None:
+    """Check received requests within the budget of the broker, and count the others."""
+    for message in received:
+        if budget is None or budget.admit(broker):
+            commands.take(message)
+        else:
+            commands.refuse_excess()
+    if budget is not None:
+        budget.end_turn()
+
+
+def late_text(broker: str, topic: str) -> str:
+    """Return the start of the problem of a missing acknowledgement."""
+    packet = f"the subscription to {topic}" if is_subscription(topic) else f"a message of {topic}"
+    return f"{broker}: expected an acknowledgement of {packet} within"
+
+
+def late_result(topic: str, size: int) -> str:
+    """Return the end of the problem of a missing acknowledgement. `size` is the length of the message, bytes."""
+    limit_s = round(CONNECT_S + size / LINK_BYTES_S)
+    return f" {limit_s} s, got none" + "; commands over MQTT do not work" * is_subscription(topic)
 
 
 class MqttSender:
@@ -240,24 +286,16 @@ class MqttSender:
         except BrokerError as error:
             pause_s, problem = self._turn.failed(self._now_ns()), str(error)
             is_repeated = self._turn.short_runs >= SHORT_RUNS and problem.endswith(LOST)
-            self._disconnect(problem, self._loss_advice() if is_repeated else "")
+            size = max((len(message.payload) for message in self._in_flight.values()), default=0)
+            advice = loss_advice(self._client_id, size, self._largest_bytes) if is_repeated else ""
+            self._disconnect(problem, advice)
             return pause_s
         return 0.0
 
-    def _loss_advice(self) -> str:
-        """Return the usual causes of repeated losses without a reason, the more probable cause first."""
-        size = max((len(message.payload) for message in self._in_flight.values()), default=0)
-        client_id = f"does another gateway use the client ID {self._client_id} (mqtt.gateway)?"
-        if size <= self._largest_bytes:
-            return f"; {client_id}"
-        return (
-            f"; does the broker accept messages of {size} bytes (largest acknowledged message: {self._largest_bytes} "
-            f"bytes)? Otherwise: {client_id}"
-        )
-
     def _open(self) -> None:
         broker = self._turn.broker
-        connection = self._connect_to(broker)
+        arguments = (broker, self._settings, self._client_id)
+        connection = connect_to(self._connect, arguments, self._will, lambda: not self._ended)
         if self._ended:
             connection.close()
             return
@@ -274,17 +312,6 @@ class MqttSender:
             self.session += 1
             self.connected, self.broker, self.problem = True, broker.name, self._unanswered
         self.wanting()
-
-    def _connect_to(self, broker: Broker) -> BrokerConnection:
-        """Connect, and without a last will if the broker does not permit retained messages. Raises BrokerError."""
-
-        def is_wanted() -> bool:
-            return not self._ended
-
-        try:
-            return self._connect(broker, self._settings, self._client_id, self._will, is_wanted)
-        except RetainRefused:
-            return self._connect(broker, self._settings, self._client_id, None, is_wanted)
 
     def _send(self, connection: BrokerConnection) -> None:
         """Send packets up to the window of the broker: subscription, replies, retained messages, then the spool."""
@@ -384,15 +411,10 @@ class MqttSender:
         now_ns = self._now_ns()
         late = next((one for one in self._in_flight.values() if now_ns > one.due_ns), None)
         if late is not None:
-            packet = (
-                f"the subscription to {late.topic}" if is_subscription(late.topic) else f"a message of {late.topic}"
-            )
-            what = f"{self.broker}: expected an acknowledgement of {packet} within"
-            if not self._unanswered.startswith(what):
-                more = "; commands over MQTT do not work" if is_subscription(late.topic) else ""
-                limit_s = round(CONNECT_S + len(late.payload) / LINK_BYTES_S)
+            text = late_text(self.broker, late.topic)
+            if not self._unanswered.startswith(text):
                 self._has_answer = False
-                self._unanswered = f"{what} {limit_s} s, got none{more}"
+                self._unanswered = text + late_result(late.topic, len(late.payload))
             self.problem = self._unanswered
         elif self._unanswered and self._has_answer:
             self.problem = self._unanswered = ""
@@ -457,16 +479,8 @@ class MqttSender:
     def _take_requests(self, connection: BrokerConnection) -> None:
         """Check received requests. The event loop runs them."""
         received, connection.received = connection.received, []
-        budget = self.budget
-        for message in received:
-            if self.commands is None:
-                continue
-            if budget is None or budget.admit(self.broker):
-                self.commands.take(message)
-            else:
-                self.commands.refuse_excess()
-        if budget is not None:
-            budget.end_turn()
+        if self.commands is not None:
+            take_requests(self.commands, received, self.budget, self.broker)
 
     def may_reply(self) -> bool:
         """Return whether the budget permits one more reply to a rejected request."""

@@ -8,13 +8,11 @@ import random
 import select
 import shutil
 import socket
-import ssl
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
-from types import SimpleNamespace
 from unittest.mock import Mock
 
 import msgspec
@@ -373,13 +371,6 @@ def test_a_file_that_cannot_be_used_is_named_with_its_key(tmp_path: Path, author
             paho_client(TLS_BROKER, settings, "one", is_v5=True, packet_bytes=99)
 
 
-def test_problems_and_properties() -> None:
-    error = ssl.SSLCertVerificationError("certificate verify failed")
-    error.verify_message = "self-signed certificate"
-    assert paho_client_module.connection_problem(error) == "self-signed certificate"
-    assert paho_client_module.properties_of("CONNECT", ReceiveMaximum=7).ReceiveMaximum == 7
-
-
 TOPIC = b"\x00\x01t"
 
 
@@ -417,23 +408,6 @@ def test_messages_that_imud_did_not_request_end_the_connection(head: bytes) -> N
     data = head + message * (RECEIVED_MAX + 1)
     with scripted(data) as broker, pytest.raises(BrokerError, match="message that imud did not request"):
         use_gateway(broker)
-
-
-def test_long_packets_and_websocket_frames_are_detected_in_any_pieces() -> None:
-    guard, data = paho_client_module.PacketGuard(PACKET_BYTES), b"\x32\x80\x01" + b"\x34" * 128 + b"\xd0\x00"
-    for at in range(len(data)):
-        guard.take(data[at : at + 1], is_writing=False)
-    for _ in range(3):
-        guard.take(data * 1000, is_writing=False)
-    with pytest.raises(ValueError, match="does not read"):
-        guard.take(b"\xc0\x00" * (UNREAD_MAX + 1), is_writing=True)
-    with pytest.raises(ValueError, match="at most 10 bytes"):
-        paho_client_module.PacketGuard(10).take(b"\x30\x0b", is_writing=False)
-    paho_client_module.PacketGuard(10).take(b"\x30\x0a", is_writing=False)
-    paho_client_module.check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES)))
-    paho_client_module.check_websocket_buffer(SimpleNamespace())  # a connection without WebSocket
-    with pytest.raises(ValueError, match="WebSocket frame of at most"):
-        paho_client_module.check_websocket_buffer(SimpleNamespace(_readbuffer=bytes(WEBSOCKET_BYTES + 1)))
 
 
 A, B = (Broker(name, 1883, False, False, "") for name in "ab")

@@ -29,7 +29,6 @@ from imud.model.errors import ServerError
 from imud.model.options import wrong_values
 from imud.model.sample import Sample, Sync, Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S
-from imud.model.work_budget import WorkBudget
 from imud.publishers import nmea0183, sentence_ports, vessel
 from imud.publishers.sentence_ports import open_serial as open_real_port
 from tests.support.event_loops import VirtualClock, in_loop
@@ -510,79 +509,6 @@ async def test_a_client_that_does_not_read_loses_complete_sentences_and_is_disco
     made.clock.advance(1)
     made.tick(made.clock.now_ns())
     assert (made.status().readers, made.status().problem) == (0, "")
-
-
-class BudgetedServer(Server):
-    """Server on which each read and each connection costs 1 ms of CPU time."""
-
-    def __init__(self) -> None:
-        self.cpu_ns = 0
-        super().__init__()
-        self._budget = WorkBudget(sentence_ports.PEER_LIMITS, self.take_cpu_ns)
-
-    def take_cpu_ns(self) -> int:
-        self.cpu_ns += 1_000_000
-        return self.cpu_ns
-
-
-@asynccontextmanager
-async def budgeted(_folder: Path) -> AsyncIterator[BudgetedServer]:
-    made = BudgetedServer()
-    yield made
-    for client in made.clients:
-        client.close()
-    made.close()
-
-
-@in_context("made", budgeted)
-async def test_data_of_clients_stay_within_the_budget(made: BudgetedServer) -> None:
-    """A client sends data without end: imud reads at most 20 ms per second, and then leaves the data in the kernel."""
-    flooding = await made.connected()
-    flooding.setblocking(False)
-    for _ in range(2000):
-        with suppress(BlockingIOError):
-            flooding.send(bytes(65_536))
-        await asyncio.sleep(0)
-    assert made.cpu_ns <= (20 + 20) * 3 * 1_000_000, "three readings of the clock for each read"
-    assert "127.0.0.1 sends more than imud processes" in made.status().problem
-    assert made.status().discarded >= 1
-    made.put(ONE)
-    assert flooding.recv(100) == ONE, "the client still gets sentences"
-    used_ns = made.cpu_ns
-    made.clock.advance(NS_PER_S)
-    made.tick(made.clock.now_ns())
-    await until(lambda: made.cpu_ns > used_ns)
-
-
-@in_context("made", budgeted)
-async def test_connections_stay_within_the_budget(made: BudgetedServer) -> None:
-    for _ in range(100):
-        made.connect().close()
-        await asyncio.sleep(0)
-    assert made.cpu_ns <= (20 + 2 * 20) * 3 * 1_000_000
-    made.clock.advance(NS_PER_S)
-    made.tick(made.clock.now_ns())
-    for _ in range(20):
-        await asyncio.sleep(0)
-    assert made.status().discarded >= 1
-
-
-def test_serial_port_without_progress_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = VirtualClock()
-    made = sentence_ports.SerialOutput("/dev/ttyUSB9", 38400, clock.now_ns)
-    master, slave = os.openpty()
-    os.set_blocking(slave, False)
-    monkeypatch.setattr(made, "_fd", slave)
-    monkeypatch.setattr(made, "_problem", "")
-    for _ in range(2000):
-        made.put(BUSY)
-    assert (made.status().readers, made.status().problem) == (1, "")
-    clock.advance(10 * NS_PER_S)
-    assert (made.status().readers, made.status().problem) == (
-        0, "the port has accepted no data for 10 s; check its flow control",
-    )  # fmt: skip
-    made.close()
-    os.close(master)
 
 
 def test_the_rest_of_a_sentence_precedes_the_next_sentence() -> None:
