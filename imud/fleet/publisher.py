@@ -43,7 +43,7 @@ from imud.host.threads import BusThread, StartWorker
 from imud.model.errors import ServerError, reason_of
 from imud.model.event import Event, EventKind
 from imud.model.sample import SAMPLE_SCHEMA
-from imud.model.staleness import STALE_LEAST_NS, STALE_PERIODS, is_stale
+from imud.model.staleness import STALE_MIN_NS, STALE_PERIODS, is_stale
 from imud.model.units import NS_PER_S
 from imud.model.work_budget import WorkBudget
 
@@ -104,7 +104,7 @@ def discovery_of(
 
 def _expiry_s(period_s: float) -> int:
     """Return the time without a message after which Home Assistant marks an entity as unavailable, s."""
-    return math.ceil(max(STALE_PERIODS * period_s, STALE_LEAST_NS / NS_PER_S))
+    return math.ceil(max(STALE_PERIODS * period_s, STALE_MIN_NS / NS_PER_S))
 
 
 def _unique_id(gateway: Gateway, device: str) -> str:

@@ -36,6 +36,10 @@ READ_FLAGS: Final = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 WRITE_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
+# `errno` of an error that only imud reports. `reason_of` shows the text of such an error.
+NO_ERRNO: Final = 0
+
+
 class NotRegularFile(OSError):
     """Path of a file that is not regular. Example: a FIFO, /dev/zero, a directory."""
 
@@ -46,7 +50,7 @@ def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
         _check_regular(os.stat(path), path)
         descriptor = os.open(path, READ_FLAGS)
     except ValueError as error:  # a path with a null character
-        raise OSError(errno.EINVAL, str(error), "…") from None
+        raise OSError(NO_ERRNO, str(error), "…") from None
     try:
         _check_regular(os.fstat(descriptor), path)
     except OSError:
@@ -74,6 +78,19 @@ def read_regular(path: str | os.PathLike[str], bytes_max: int) -> bytes:
     """Return at most `bytes_max` bytes of a regular file. Raises the errors of `open_regular`."""
     with open_regular(path) as file:
         return file.read(bytes_max)
+
+
+class FileTooLong(OSError):
+    """Regular file that is longer than expected."""
+
+
+def read_regular_file(path: str | os.PathLike[str], bytes_max: int) -> bytes:
+    """Return the complete content of a regular file. Raises FileTooLong if it is longer than `bytes_max`, and the
+    errors of `open_regular`. It never waits for a FIFO or a device: use it for each file that a user names."""
+    content = read_regular(path, bytes_max + 1)
+    if len(content) > bytes_max:
+        raise FileTooLong(NO_ERRNO, f"expected at most {bytes_max} bytes, got more", os.fspath(path))
+    return content
 
 
 def replace_file(path: Path, content: bytes, *, mode: int = 0o640, owner: tuple[int, int] | None = None) -> None:
@@ -113,7 +130,7 @@ def _check_regular(status: os.stat_result, path: str | os.PathLike[str]) -> None
         raise NotRegularFile(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
     if not stat.S_ISREG(status.st_mode):
         kind = next((name for is_kind, name in KINDS if is_kind(status.st_mode)), "something else")
-        raise NotRegularFile(errno.EINVAL, f"is {kind}, expected a regular file", os.fspath(path))
+        raise NotRegularFile(NO_ERRNO, f"is {kind}, expected a regular file", os.fspath(path))
 
 
 _OTHERS_WRITE: Final = stat.S_IWGRP | stat.S_IWOTH

@@ -1,14 +1,18 @@
-"""Decision whether a value is still current. All outputs use this function."""
+"""Time after which a value without a new sample is not a current value. All outputs use this decision."""
 
 from typing import Final
 
 from imud.model.units import NS_PER_S
 
-STALE_PERIODS: Final = 3  # number of periods without a sample after which a value is stale
-STALE_LEAST_NS: Final = NS_PER_S  # minimum time without a sample after which a value is stale, ns
+STALE_PERIODS: Final = 3  # number of periods without a new sample after which a value is stale
+STALE_MIN_NS: Final = NS_PER_S  # minimum age of a stale value, ns: a fast device may pause for some periods
+
+
+def stale_after_ns(period_ns: int) -> int:
+    """Return the maximum age of a current value, ns. `period_ns` is the time between two values."""
+    return max(STALE_PERIODS * period_ns, STALE_MIN_NS)
 
 
 def is_stale(last_sample_ns: int, now_ns: int, period_ns: int) -> bool:
-    """Return whether a value of the newest sample is no longer current. `period_ns` is the time between two samples; 0:
-    unknown."""
-    return now_ns - last_sample_ns > max(STALE_PERIODS * period_ns, STALE_LEAST_NS)
+    """Return whether the value of the sample that arrived at `last_sample_ns` is no longer a current value."""
+    return now_ns - last_sample_ns > stale_after_ns(period_ns)

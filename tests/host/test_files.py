@@ -3,6 +3,7 @@
 import errno
 import grp
 import os
+import re
 import socket
 import stat
 import threading
@@ -14,6 +15,7 @@ import msgspec
 import pytest
 
 from imud.host import files
+from imud.model.errors import reason_of
 
 
 def bound_socket(path: Path) -> None:
@@ -38,6 +40,9 @@ def test_other_file_types_are_rejected_immediately(make: Callable[[Path], None],
     for path, expected in ((tmp_path / "it", words), ("a\0b", "null")):
         with pytest.raises(OSError, match=expected):
             files.open_regular(path)
+        with pytest.raises(OSError, match=expected) as raised:
+            files.read_regular_file(path, 1000)
+        assert re.search(expected, reason_of(raised.value)), "a message must name the type"
 
 
 def test_a_file_replaced_between_check_and_opening(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -66,6 +71,15 @@ def test_no_more_is_read_than_wanted(tmp_path: Path) -> None:
     files.replace_file(path, b"short")
     assert files.read_regular(path, 1000) == b"short"
     assert path.stat().st_mode & 0o777 == 0o640 & ~_umask()
+
+
+def test_complete_content_up_to_a_limit(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(b"12345")
+    assert files.read_regular_file(path, 5) == b"12345"
+    with pytest.raises(files.FileTooLong) as raised:
+        files.read_regular_file(path, 4)
+    assert reason_of(raised.value) == "expected at most 4 bytes, got more"
 
 
 @pytest.mark.parametrize("failing", ["os.fsync", "os.replace", "os.fchown"])

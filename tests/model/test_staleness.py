@@ -1,17 +1,17 @@
-"""Stale values: three periods, at least one second."""
+"""Age after which a value is stale."""
 
 import pytest
 
-from imud.model.staleness import is_stale
-from imud.model.units import NS_PER_S
+from imud.model.staleness import is_stale, stale_after_ns
+from imud.model.units import NS_PER_MS, NS_PER_S
 
 
 @pytest.mark.parametrize(
-    ("age_ns", "period_ns", "stale"),
-    [
-        (NS_PER_S, 0, False), (NS_PER_S + 1, 0, True), (NS_PER_S, NS_PER_S // 100, False),
-        (NS_PER_S + 1, NS_PER_S // 100, True), (3 * NS_PER_S, NS_PER_S, False), (3 * NS_PER_S + 1, NS_PER_S, True),
-    ],
-)  # fmt: skip
-def test_values_after_three_periods(age_ns: int, period_ns: int, stale: bool) -> None:
-    assert is_stale(7, 7 + age_ns, period_ns) == stale
+    ("period_ns", "limit_ns"),
+    [(0, NS_PER_S), (10 * NS_PER_MS, NS_PER_S), (NS_PER_S // 3, NS_PER_S), (NS_PER_S, 3 * NS_PER_S)],
+)
+def test_three_periods_but_at_least_one_second(period_ns: int, limit_ns: int) -> None:
+    start_ns = 1000 * NS_PER_S
+    assert stale_after_ns(period_ns) == limit_ns
+    assert not is_stale(start_ns, start_ns + limit_ns, period_ns)
+    assert is_stale(start_ns, start_ns + limit_ns + 1, period_ns)
