@@ -16,6 +16,7 @@ from intelhex import IntelHex, IntelHexError
 from imud.cli.arguments import CliCommand, add_socket
 from imud.client.connection import Client, decoded
 from imud.contracts.firmware import IMAGE_BYTES_MAX, TOTAL_S, FirmwareImage, FirmwareResult
+from imud.host.files import read_regular
 from imud.model.errors import BadArgument, reason_of
 from imud.model.event import Event, EventKind
 
@@ -62,8 +63,7 @@ def read_image(path: Path) -> FirmwareImage:
     Raises BadArgument for another, damaged or truncated file.
     """
     try:
-        with path.open("rb") as file:
-            content = file.read(FILE_BYTES_MAX + 1)
+        content = read_regular(path, FILE_BYTES_MAX + 1)
     except OSError as error:
         raise BadArgument(f"cannot read {path}: {reason_of(error)}") from None
     return parse_image(content, path)

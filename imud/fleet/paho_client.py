@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import msgspec
 
 from imud.fleet.settings import Broker, MqttOptions
-from imud.host.files import read_regular
+from imud.host.files import read_regular_file
 from imud.host.network import tls_context
 from imud.model.errors import reason_of
 
@@ -258,7 +258,7 @@ def _password(path: str | None) -> str | None:
     if path is None:
         return None
     try:
-        text = _read("password_file", path, PASSWORD_BYTES).decode("utf-8")
+        text = _read("password_file", path, PASSWORD_BYTES + len("\r\n")).decode("utf-8")
     except UnicodeDecodeError as error:
         raise ValueError(f"password_file {path}: expected text in UTF-8, got other bytes") from error
     return text.partition("\n")[0].rstrip("\r")
@@ -293,6 +293,6 @@ def _no_passphrase() -> str:
 
 def _read(name: str, path: str, most: int) -> bytes:
     try:
-        return read_regular(Path(path), most)
+        return read_regular_file(Path(path), most)
     except OSError as error:
         raise ValueError(f"{name} {path}: {reason_of(error)}") from error

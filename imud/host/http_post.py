@@ -6,7 +6,7 @@ from pathlib import PurePath
 from typing import Final, NamedTuple
 from urllib.parse import parse_qsl, urlsplit
 
-from imud.host.files import open_regular, read_regular
+from imud.host.files import read_regular_file
 from imud.host.http_reply import HttpReply, InvalidReply
 from imud.host.network import tls_context
 from imud.host.timed_connection import TimedConnection
@@ -132,10 +132,7 @@ class HttpPost:
         if not tls:
             self._connection.open(host, port)
             return
-        ca_file = self._access.ca_file
-        if ca_file is not None:
-            open_regular(ca_file).close()  # OpenSSL would wait for the writer of a FIFO
-        self._connection.open(host, port, tls_context(ca_file))
+        self._connection.open(host, port, tls_context(self._access.ca_file))
 
     def _head(self, body_bytes: int) -> bytes:
         """Return request line and headers."""
@@ -162,7 +159,7 @@ class HttpPost:
         if path is None:
             return {}
         try:
-            text = read_regular(path, TOKEN_BYTES).partition(b"\n")[0].strip().decode("ascii")
+            text = read_regular_file(path, TOKEN_BYTES).partition(b"\n")[0].strip().decode("ascii")
         except OSError as error:
             raise OSError(f"cannot read token_file {path}: {reason_of(error)}") from error
         except UnicodeDecodeError:

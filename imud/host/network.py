@@ -1,15 +1,14 @@
 """TCP and UDP sockets for an IP address, and addresses of a host name."""
 
-import asyncio
 import fcntl
 import socket
 import struct
-import threading
 from array import array
-from contextlib import suppress
 from ipaddress import IPv4Network
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from imud.host.files import NO_ERRNO, read_regular_file
+from imud.host.threads import call_in_thread
 from imud.model.errors import reason_of
 
 if TYPE_CHECKING:
@@ -28,35 +27,17 @@ def open_socket(address: str, kind: socket.SocketKind) -> socket.socket:
 
 
 async def resolve(host: str, port: int) -> list[str]:
-    """Return the IP addresses of a host name. Raises OSError.
+    """Return the IP addresses of a host name. Raises OSError. A silent name server delays no other work."""
 
-    The request runs in a thread of its own: a silent name server delays neither the end of the process nor other work.
-    A thread of the event loop's executor would do both, because the request cannot be cancelled.
-    """
-    loop = asyncio.get_running_loop()
-    answer: asyncio.Future[list[str]] = loop.create_future()
-
-    def give(found: list[str], error: OSError | None) -> None:
-        if answer.done():  # the caller no longer waits
-            return
-        if error is None:
-            answer.set_result(found)
-        else:
-            answer.set_exception(error)
-
-    def ask() -> None:
-        found, problem = list[str](), None
+    def request_addresses() -> list[str]:
         try:
-            found = [str(one[4][0]) for one in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)]
-        except OSError as error:
-            problem = error
+            entries = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
         except UnicodeError as error:  # a name that IDNA cannot encode
-            problem = OSError(f"{host}: {reason_of(error)}")
-        with suppress(RuntimeError):  # the loop has ended
-            loop.call_soon_threadsafe(give, list(dict.fromkeys(found)), problem)
+            raise OSError(f"{host}: {reason_of(error)}") from None
+        addresses = [str(entry[4][0]) for entry in entries]
+        return list(dict.fromkeys(addresses))
 
-    threading.Thread(target=ask, name="name server", daemon=True).start()
-    return await answer
+    return await call_in_thread("name server", request_addresses)
 
 
 def listen(address: str, port: int) -> socket.socket:
@@ -125,15 +106,27 @@ def _interface_address(requester: socket.socket, entry: bytes) -> InterfaceAddre
     )
 
 
+CA_BYTES_MAX: Final = 1 << 20  # maximum length of a file with CA certificates, bytes. All CAs of Debian need 220 kB.
+PEM_CERTIFICATE: Final = "-----BEGIN"  # start of a certificate in PEM
+
+
 def tls_context(ca_file: str | None) -> "ssl.SSLContext":
-    """Return a context for connections to servers with a valid certificate. Raises OSError if imud cannot read
-    `ca_file`; None: the certificates that the system trusts.
+    """Return a context for connections to servers with a valid certificate. Raises OSError if `ca_file` is not a
+    regular file with certificates; None: the certificates that the system trusts.
+
+    imud reads the file itself, because OpenSSL would wait for a FIFO.
 
     Python 3.13 rejects CA certificates without the extension "key usage". Certificates that a server made itself often
     lack it. imud accepts them, as with older versions of Python.
     """
     import ssl
 
-    context = ssl.create_default_context(cafile=ca_file)
+    certificates: str | None = None
+    if ca_file is not None:
+        content = read_regular_file(ca_file, CA_BYTES_MAX)
+        certificates = content.decode("latin-1").encode("ascii", "replace").decode("ascii")  # comments in UTF-8
+        if PEM_CERTIFICATE not in certificates:  # with empty data, Python would trust all CAs of the system
+            raise ssl.SSLError(NO_ERRNO, "expected certificates (PEM), got a file without a certificate")
+    context = ssl.create_default_context(cadata=certificates)
     context.verify_flags &= ~ssl.VERIFY_X509_STRICT
     return context

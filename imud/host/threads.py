@@ -4,6 +4,7 @@ A worker calls `do_round` of its job, which returns the time of the next sleep. 
 times of their choice (`tests/support/event_loops.py`).
 """
 
+import asyncio
 import gc
 import os
 import select
@@ -12,7 +13,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final, Protocol, TypeVar
 
 from imud.model.units import NS_PER_S
 
@@ -28,6 +29,39 @@ END_LIMIT_S = 5.0
 SWITCH_INTERVAL_S: Final = 0.0003
 
 SELECT_FDS: Final = 1024  # limit of descriptor numbers for `select` (FD_SETSIZE)
+
+T = TypeVar("T")
+
+
+def call_in_thread(name: str, function: Callable[[], T]) -> "asyncio.Future[T]":
+    """Call a function in a new daemon thread, and return its result or its exception. Needs a running event loop.
+
+    A function that hangs (a silent name server, a file on a dead network disk) delays neither the end of the process
+    nor other calls. A thread of the event loop's executor would delay both, because nobody can cancel the function.
+    """
+    loop = asyncio.get_running_loop()
+    future: asyncio.Future[T] = loop.create_future()
+
+    def finish(result: T | None, error: BaseException | None) -> None:
+        if future.done():  # the caller no longer waits
+            return
+        if error is None:
+            future.set_result(result)  # type: ignore[arg-type] # without an error, the result has the type T
+        else:
+            future.set_exception(error)
+
+    def run() -> None:
+        result: T | None = None
+        problem: BaseException | None = None
+        try:
+            result = function()
+        except BaseException as error:  # noqa: BLE001 - the caller raises the error again
+            problem = error
+        with suppress(RuntimeError):  # the loop has ended
+            loop.call_soon_threadsafe(finish, result, problem)
+
+    threading.Thread(target=run, name=name, daemon=True).start()
+    return future
 
 
 class Job(Protocol):

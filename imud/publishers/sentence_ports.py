@@ -5,12 +5,14 @@ import logging
 import os
 import socket
 from collections.abc import Callable
+from functools import partial
 from typing import Final, Protocol
 
 import serial
 
 from imud.contracts.status import OutputStatus
 from imud.host.network import listen, open_socket
+from imud.host.threads import call_in_thread
 from imud.model.errors import ServerError, reason_of
 from imud.model.units import NS_PER_S
 from imud.model.work_budget import WorkBudget, WorkLimits
@@ -336,8 +338,7 @@ class SerialOutput:
     def tick(self, now_ns: int) -> None:
         """Open the port if an attempt is due."""
         if self._fd is None and self._opening is None and now_ns >= self._due_ns:
-            loop = asyncio.get_running_loop()
-            self._opening = loop.run_in_executor(None, self._open_port, self._port, self._baud)
+            self._opening = call_in_thread("nmea0183", partial(self._open_port, self._port, self._baud))
             self._opening.add_done_callback(self._opened)
 
     def status(self) -> OutputStatus:

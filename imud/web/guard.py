@@ -12,9 +12,9 @@ import hashlib
 import hmac
 from collections.abc import Callable, Collection, Mapping
 from ipaddress import ip_address
-from pathlib import Path
 from typing import Final, NamedTuple
 
+from imud.host.files import read_regular_file
 from imud.model.errors import BadArgument, reason_of
 
 TOKEN_CHARACTERS_MIN: Final = 20
@@ -140,8 +140,7 @@ def is_loopback(address: str) -> bool:
 def read_token(path: str) -> bytes:
     """Return the token in the first line of a file. Raises BadArgument if it is not readable or too short."""
     try:
-        with Path(path).open("rb") as file:
-            token = file.read(TOKEN_BYTES_MAX).split(b"\n", 1)[0].strip()
+        token = read_regular_file(path, TOKEN_BYTES_MAX).split(b"\n", 1)[0].strip()
     except OSError as error:
         raise BadArgument(f"--token-file {path}: {reason_of(error)}") from error
     if len(token) < TOKEN_CHARACTERS_MIN:

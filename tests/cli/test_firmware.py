@@ -1,6 +1,7 @@
 """`imud firmware`: files of the vendor, and an update through a running daemon with a simulated device."""
 
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -76,6 +77,9 @@ def test_too_large_and_missing_files_are_refused(tmp_path: Path) -> None:
         read_image(hex_file(tmp_path / "new.hex", (0, bytes(IMAGE_BYTES_MAX + 10))))
     with pytest.raises(BadArgument, match=r"cannot read .*: No such file or directory"):
         read_image(tmp_path / "missing.hex")
+    os.mkfifo(tmp_path / "fifo.hex")
+    with pytest.raises(BadArgument, match="is a FIFO, expected a regular file"):
+        read_image(tmp_path / "fifo.hex")
 
 
 # --- the command ------------------------------------------------------------------------------------------------------

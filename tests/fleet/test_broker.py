@@ -364,8 +364,12 @@ def test_a_file_that_cannot_be_used_is_named_with_its_key(tmp_path: Path, author
     path.mkdir()
     with pytest.raises(ValueError, match=f"^{name} {path}: Is a directory$"):
         paho_client(TLS_BROKER, settings, "one", is_v5=True, packet_bytes=99)
+    path.rmdir()
+    os.mkfifo(path)
+    with pytest.raises(ValueError, match=f"^{name} {path}: is a FIFO, expected a regular file$"):
+        paho_client(TLS_BROKER, settings, "one", is_v5=True, packet_bytes=99)
     if name != "password_file":
-        path.rmdir()
+        path.unlink()
         path.write_text("no certificate\n")
         with pytest.raises(ValueError, match=rf"{name} {path}.*: expected .* \(PEM\)"):
             paho_client(TLS_BROKER, settings, "one", is_v5=True, packet_bytes=99)

@@ -1,6 +1,7 @@
 """POST requests: headers, connections that stay open, and TLS errors."""
 
 import gzip
+import os
 from pathlib import Path
 
 import pytest
@@ -54,6 +55,21 @@ def test_an_invalid_token_file_is_named(tmp_path: Path, content: bytes | None) -
         one = post(database, PostAccess(str(path)))
         with pytest.raises(OSError, match=rf"token_file {path}: {problem}"):
             one.post(BODY)
+        assert not database.requests
+
+
+def test_token_and_ca_file_are_fifos(tmp_path: Path) -> None:
+    fifo = tmp_path / "fifo"
+    os.mkfifo(fifo)
+    with fake_database() as database:
+        url = post_url(database.url)
+        assert url is not None
+        for delivery in (
+            HttpPost(url, PostAccess(token_file=str(fifo))),
+            HttpPost(url._replace(tls=True), PostAccess(ca_file=str(fifo))),
+        ):
+            with pytest.raises(OSError, match="is a FIFO, expected a regular file"):
+                delivery.post(BODY)
         assert not database.requests
 
 

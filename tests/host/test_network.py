@@ -4,15 +4,18 @@ import asyncio
 import errno
 import os
 import socket
+import ssl
 import subprocess
 import sys
 import threading
 from ipaddress import IPv4Address, IPv4Network
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from imud.host.network import interface_addresses, listen, resolve
+from imud.host.files import FileTooLong, NotRegularFile
+from imud.host.network import CA_BYTES_MAX, interface_addresses, listen, resolve, tls_context
 from imud.host.scrape_server import HttpRequest, HttpResponse, ScrapeServer
 from imud.model.errors import ServerError
 from imud.publishers.sentence_ports import TcpOutput, UdpOutput
@@ -111,3 +114,29 @@ def test_several_addresses_of_an_interface() -> None:
     if output.returncode:
         pytest.skip(f"cannot create a network: {output.stderr.strip()}")
     assert output.stdout.strip() == "['127.0.0.0/8', '192.0.2.0/24', '198.51.100.1/32']"
+
+
+def test_certificates_of_authorities_without_a_regular_file(tmp_path: Path) -> None:
+    """OpenSSL would wait for the FIFO. Python would trust the authorities of the system instead of an empty file."""
+    fifo = tmp_path / "fifo"
+    os.mkfifo(fifo)
+    with pytest.raises(NotRegularFile, match="is a FIFO, expected a regular file"):
+        tls_context(str(fifo))
+    empty = tmp_path / "empty"
+    for content in (b"", b"\n", b"text"):
+        empty.write_bytes(content)
+        with pytest.raises(ssl.SSLError, match="expected certificates"):
+            tls_context(str(empty))
+    empty.write_bytes(bytes(CA_BYTES_MAX + 1))
+    with pytest.raises(FileTooLong):
+        tls_context(str(empty))
+
+
+def test_comments_between_certificates(tmp_path: Path) -> None:
+    bundle = ssl.get_default_verify_paths().cafile or "/etc/ssl/certs/ca-certificates.crt"
+    if not Path(bundle).exists():
+        pytest.skip("this host has no bundle of certificates (ca-certificates)")
+    file = tmp_path / "ca.pem"
+    file.write_bytes("# Főtanúsítvány\n".encode() + Path(bundle).read_bytes())
+    expected = ssl.create_default_context(cafile=bundle)
+    assert tls_context(str(file)).cert_store_stats() == expected.cert_store_stats()

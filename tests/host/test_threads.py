@@ -1,5 +1,6 @@
 """Threads of the daemon: waits that end early, descriptors that end them, and the end of a worker."""
 
+import asyncio
 import gc
 import os
 import sys
@@ -13,7 +14,15 @@ from unittest.mock import Mock, create_autospec
 
 import pytest
 
-from imud.host.threads import BusThread, DescriptorWait, Job, WakeEvent, rare_garbage_collection
+from imud.host.threads import (
+    BusThread,
+    DescriptorWait,
+    Job,
+    WakeEvent,
+    call_in_thread,
+    rare_garbage_collection,
+)
+from tests.support.event_loops import in_loop
 
 LIMIT_S = 60.0
 NEVER_NS = 10**12
@@ -173,3 +182,34 @@ def test_settings_of_the_interpreter_are_restored() -> None:
             assert sys.getswitchinterval() == pytest.approx(expected_s, abs=2e-6)
     finally:
         sys.setswitchinterval(switch_s)
+
+
+@in_loop
+async def test_call_returns_result_and_exception() -> None:
+    def fail() -> None:
+        raise SystemExit("no")  # an exception of each class belongs to the caller
+
+    assert await call_in_thread("call", threading.get_ident) != threading.get_ident()
+    with pytest.raises(SystemExit, match="no"):
+        await call_in_thread("call", fail)
+
+
+def test_hanging_call_does_not_delay_the_end() -> None:
+    release = threading.Event()
+    threads: list[threading.Thread] = []
+
+    def hang() -> None:
+        threads.append(threading.current_thread())
+        release.wait(LIMIT_S)  # a failed assertion must not wait without a limit
+
+    async def cancel() -> None:
+        call = call_in_thread("call", hang)
+        while not threads:
+            await asyncio.sleep(0)
+        call.cancel()
+
+    asyncio.run(cancel())  # waits for the executor of the loop
+    assert threads[0].daemon
+    assert threads[0].is_alive()
+    release.set()
+    threads[0].join(LIMIT_S)

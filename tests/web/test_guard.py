@@ -1,5 +1,6 @@
 """Access control: Host, Origin, token, cookie."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -92,3 +93,6 @@ def test_a_token_comes_from_the_first_line_of_a_file(tmp_path: Path) -> None:
             read_token(str(file))
     with pytest.raises(BadArgument, match="No such file"):
         read_token(str(tmp_path / "none"))
+    os.mkfifo(tmp_path / "fifo")
+    with pytest.raises(BadArgument, match="is a FIFO, expected a regular file"):
+        read_token(str(tmp_path / "fifo"))

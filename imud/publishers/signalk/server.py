@@ -19,6 +19,7 @@ import ssl
 import uuid
 from collections import deque
 from collections.abc import Coroutine
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -28,6 +29,7 @@ from imud.contracts.status import OutputStatus
 from imud.host.files import StateFile
 from imud.host.installation import needs_extra
 from imud.host.network import resolve, tls_context
+from imud.host.threads import call_in_thread
 from imud.model.errors import ServerError, reason_of
 from imud.model.options import shown
 from imud.publishers.signalk.settings import WHO, SignalKOptions, address_of
@@ -171,8 +173,7 @@ class SignalKServer:
 
     async def _run(self) -> None:
         """Connect again and again, until the server denies the access."""
-        # an import of 0.3 s, in a thread
-        await asyncio.get_running_loop().run_in_executor(None, importlib.import_module, "aiohttp")
+        await call_in_thread("signalk", partial(importlib.import_module, "aiohttp"))  # an import of 0.3 s
         from aiohttp import ClientError  # not at the top of the module: see above
 
         while self._problem != DENIED:
@@ -197,7 +198,7 @@ class SignalKServer:
 
         context: ssl.SSLContext | bool = True
         if self._url.startswith("https:"):
-            context = await asyncio.get_running_loop().run_in_executor(None, tls_context, self._ca_file)
+            context = await call_in_thread("signalk", partial(tls_context, self._ca_file))
         connector = TCPConnector(ssl=context, resolver=_resolver(), limit=2)
         timeout = ClientTimeout(total=None)  # every request has the timeout REPLY_S
         return ClientSession(self._url, connector=connector, timeout=timeout, cookie_jar=DummyCookieJar())
