@@ -7,19 +7,20 @@ broken connection. TCP keep-alive detects a missing gpsd.
 
 import asyncio
 import socket
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable
-from contextlib import suppress
-from typing import Annotated, Final, Literal, NamedTuple, Protocol
+from typing import Annotated, Any, Final, Literal, NamedTuple, Protocol
 
 import msgspec
 from msgspec import Meta
 
 from imud.contracts.link import StreamLink
 from imud.formats.nmea0183 import RMC_BYTES_MAX
-from imud.host.network import resolve
+from imud.host.peer_stream import READ_BYTES, TICK_S, PeerStream, open_peer_stream
 from imud.model.errors import LinkError, reason_of
 from imud.model.options import Options, is_host, shown
+from imud.model.work_budget import WorkBudget, WorkLimits
 
 # called with one RMC sentence including its line end, and with CLOCK_MONOTONIC right after its arrival, ns
 OnSentence = Callable[[bytes, int], None]
@@ -59,8 +60,12 @@ class RmcSource(Protocol):
     """Source of sentences, valid or not. It recovers from failures. Synchronization: the event loop's thread only."""
 
     title: str  # Name of the source for the user. Example: `gpsd at 127.0.0.1:2947`.
-    problem: str  # reason why the source delivers no sentences, one sentence; empty if it delivers sentences
     sentences: int  # number of sentences since the start
+
+    @property
+    def problem(self) -> str:
+        """Reason why the source delivers no sentences, or too much data, one sentence; empty if it has no problem."""
+        ...
 
     def start(self, on_sentence: OnSentence) -> None:
         """Start to deliver sentences. Needs a running event loop."""
@@ -75,6 +80,7 @@ class SourceContext(NamedTuple):
     make_port: MakePort
     now_ns: Callable[[], int]  # CLOCK_MONOTONIC, ns
     utc_offset_ns: Callable[[], int]  # CLOCK_REALTIME minus CLOCK_MONOTONIC, ns
+    cpu_ns: Callable[[], int] = time.thread_time_ns  # CPU time of the event loop's thread, ns
 
 
 # Makes a source. `imud.utc.RMC_SOURCES` contains one for each value of `RmcOptions.source`.
@@ -127,10 +133,12 @@ class Retry:
 class ReconnectingSource(ABC):
     """Source that connects again after each end of its stream. Synchronization: the event loop's thread only."""
 
-    def __init__(self, title: str, retry: Retry | None) -> None:
+    def __init__(self, title: str, context: SourceContext, retry: Retry | None) -> None:
         self.title = title
-        self.problem = ""
         self.sentences = 0
+        self._now_ns = context.now_ns
+        self._budget = WorkBudget(WorkLimits(), context.cpu_ns)
+        self._fault = ""  # reason why the source delivers no sentences
         self._retry = retry or Retry()
         self._splitter = SentenceSplitter()
         self._on_sentence: OnSentence = _ignore
@@ -147,9 +155,13 @@ class ReconnectingSource(ABC):
             self._task.cancel()
             self._task = None
 
+    @property
+    def problem(self) -> str:
+        return self._fault or self._budget.problem(self._now_ns())
+
     @abstractmethod
     async def _connect_and_read(self) -> None:
-        """Serve one connection until its end, and store the reason of the end in `problem`."""
+        """Serve one connection until its end, and store the reason of the end in `_fault`."""
 
     @abstractmethod
     def _disconnect(self) -> None:
@@ -164,7 +176,7 @@ class ReconnectingSource(ABC):
     def _on_data(self, data: bytes, t_rx_ns: int) -> None:
         """Add bytes of the stream. `t_rx_ns` is CLOCK_MONOTONIC right after the read."""
         for sentence in self._splitter.feed(data):
-            self.problem = ""
+            self._fault = ""
             self.sentences += 1
             self._retry.reset()
             self._on_sentence(sentence, t_rx_ns)
@@ -184,7 +196,6 @@ def _ignore(_sentence: bytes, _t_rx_ns: int) -> None:
 
 
 CONNECT_LIMIT_S: Final = 5.0
-READ_BYTES: Final = 65536
 # seconds of silence before the first probe, seconds between probes, number of probes: imud detects a loss within 25 s
 KEEP_ALIVE: Final = ((socket.TCP_KEEPIDLE, 10), (socket.TCP_KEEPINTVL, 5), (socket.TCP_KEEPCNT, 3))
 
@@ -192,80 +203,89 @@ KEEP_ALIVE: Final = ((socket.TCP_KEEPIDLE, 10), (socket.TCP_KEEPINTVL, 5), (sock
 class GpsdSource(ReconnectingSource):
     """Client of gpsd."""
 
-    def __init__(self, settings: RmcOptions, now_ns: Callable[[], int], retry: Retry | None = None) -> None:
-        super().__init__(f"gpsd at {settings.host}:{settings.tcp_port}", retry)
-        self._now_ns = now_ns
-        self._address = settings.host, settings.tcp_port
-        self._watch = _watch_request(settings.gps)
-        self._writer: asyncio.StreamWriter | None = None
+    def __init__(self, options: RmcOptions, context: SourceContext, retry: Retry | None = None) -> None:
+        super().__init__(f"gpsd at {options.host}:{options.tcp_port}", context, retry)
+        self._address = options.host, options.tcp_port
+        self._watch = _watch_request(options.gps)
+        self._stream: PeerStream | None = None
 
     async def _connect_and_read(self) -> None:
         try:
             async with asyncio.timeout(CONNECT_LIMIT_S):
-                reader, writer = await _connect(*self._address)
+                stream = await open_peer_stream(*self._address, self.title, self._budget, self._now_ns)
         except (OSError, TimeoutError) as error:
             reason = "no answer" if isinstance(error, TimeoutError) else reason_of(error)
-            self.problem = f"cannot connect to {self.title}: {reason}; is gpsd running?"
+            self._fault = f"cannot connect to {self.title}: {reason}; is gpsd running?"
             return
-        self._writer = writer
+        self._stream = stream
         try:
-            _keep_alive(writer.get_extra_info("socket"))
-            writer.write(self._watch)
-            self.problem = f"{self.title} has no sentences yet: does its receiver have a view of the sky?"
-            while data := await reader.read(READ_BYTES):
+            _keep_alive(stream.get_extra_info("socket"))
+            stream.write(self._watch)
+            self._fault = f"{self.title} has no sentences yet: does its receiver have a view of the sky?"
+            while data := await stream.read():
                 self._on_data(data, self._now_ns())
-            self.problem = f"{self.title} closed the connection"
+            self._fault = f"{self.title} closed the connection"
         except OSError as error:
-            self.problem = f"{self.title} broke the connection: {reason_of(error)}"
+            self._fault = f"{self.title} broke the connection: {reason_of(error)}"
         finally:
-            self._disconnect()
-            with suppress(OSError):
-                await writer.wait_closed()
+            self._stream = None
+            await stream.close()
 
     def _disconnect(self) -> None:
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
+        if self._stream is not None:
+            self._stream.abort()
+            self._stream = None
 
 
 class NmeaPortSource(ReconnectingSource):
     """NMEA 0183 receiver on a serial port."""
 
-    def __init__(self, link: StreamLink, retry: Retry | None = None) -> None:
-        super().__init__(f"NMEA receiver on {link.title}", retry)
+    def __init__(self, link: StreamLink, context: SourceContext, retry: Retry | None = None) -> None:
+        super().__init__(f"NMEA receiver on {link.title}", context, retry)
         self._link = link
         self._ended = asyncio.Event()
+        self._pause: asyncio.TimerHandle | None = None  # end of the pause of a port above its budget
 
     async def _connect_and_read(self) -> None:
         link = self._link
         self._ended.clear()
-        self.problem = f"{self.title}: the port does not exist"
+        self._fault = f"{self.title}: the port does not exist"
         await link.wait_present()
         try:
             link.open()
-            self.problem = f"{self.title} has sent no sentence yet: is its rate {link.baud} bit/s?"
-            link.start(self._on_data, self._on_end)
+            self._fault = f"{self.title} has sent no sentence yet: is its rate {link.baud} bit/s?"
+            link.start(self._on_bytes, self._on_end)
             await self._ended.wait()
         except LinkError as error:
-            self.problem = str(error)
+            self._fault = str(error)
         finally:
-            link.close()
+            self._disconnect()
 
     def _disconnect(self) -> None:
+        if self._pause is not None:
+            self._pause.cancel()
+            self._pause = None
         self._link.close()
 
+    def _on_bytes(self, data: bytes, t_rx_ns: int) -> None:
+        """Process a read of the port. Above the budget, discard the rest and pause the port until the next tick."""
+        self._budget.start_turn(t_rx_ns)
+        for start in range(0, len(data), READ_BYTES):
+            if not self._budget.admit(self.title):
+                self._splitter.clear()
+                self._link.pause()
+                self._pause = asyncio.get_running_loop().call_later(TICK_S, self._resume)
+                break
+            self._on_data(data[start : start + READ_BYTES], t_rx_ns)
+        self._budget.end_turn()
+
+    def _resume(self) -> None:
+        self._pause = None
+        self._link.resume()
+
     def _on_end(self, error: LinkError | None) -> None:
-        self.problem = str(error) if error else f"{self.title} ended"
+        self._fault = str(error) if error else f"{self.title} ended"
         self._ended.set()
-
-
-async def _connect(host: str, port: int) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-    """Connect to the first address of a host that accepts the connection. Raises OSError."""
-    *others, last = await resolve(host, port)
-    for address in others:
-        with suppress(OSError):
-            return await asyncio.open_connection(address, port)
-    return await asyncio.open_connection(last, port)
 
 
 def _watch_request(device: str) -> bytes:
@@ -275,15 +295,15 @@ def _watch_request(device: str) -> bytes:
     return b"?WATCH=" + msgspec.json.encode(watch) + b";\n"
 
 
-def _keep_alive(sock: socket.socket) -> None:
+def _keep_alive(sock: Any) -> None:
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in KEEP_ALIVE:
         sock.setsockopt(socket.IPPROTO_TCP, option, value)
 
 
 def make_gpsd(settings: RmcOptions, context: SourceContext) -> GpsdSource:
-    return GpsdSource(settings, context.now_ns)
+    return GpsdSource(settings, context)
 
 
 def make_nmea(settings: RmcOptions, context: SourceContext) -> NmeaPortSource:
-    return NmeaPortSource(context.make_port(settings.port, settings.baud))
+    return NmeaPortSource(context.make_port(settings.port, settings.baud), context)

@@ -22,6 +22,10 @@ GUARD_NS: Final = 20 * NS_PER_MS
 PULSE_FRESH_NS: Final = NS_PER_S + 100 * NS_PER_MS  # maximum age of a pulse that predicts the next pulse, ns
 AHEAD_NS: Final = 5 * NS_PER_MS  # maximum time that a sentence may be ahead of the reference, ns
 SIGMAS: Final = 3
+# The rate counts real time. A sentence may be early by half a period, because its delay changes. The feed permits 1 %
+# more sentences than the configured rate, because the oscillators of receiver and host differ.
+EARLY_PERIODS: Final = 0.5
+PERIOD_FACTOR: Final = 0.99
 DOUBT_MOST_NS: Final = NS_PER_S // 4  # maximum error of a usable reference, ns
 
 
@@ -32,9 +36,11 @@ class Refusal(StrEnum):
     NOT_VALID = "not_valid"  # marked as invalid by the receiver (status V), or without a time
     # before the release of imud, or in contradiction to a synchronized system clock: `imud.device.utc` rejects them
     IMPLAUSIBLE = "implausible"
+    # the time did not advance like CLOCK_MONOTONIC since the previous sentence: `imud.device.utc` rejects the sentence
+    LEAP = "leap"
     STALE = "stale"  # the transmission would not end before the next second
     AHEAD = "ahead"  # the time is in the future according to the PPS line or to the host's UTC reference
-    TOO_MANY = "too_many"  # above the configured rate
+    TOO_MANY = "too_many"  # above the configured rate, in real time or in the time of the sentences
     BUSY = "busy"  # A script was running on the device
     LINK = "link"  # the port did not accept the bytes
 
@@ -52,6 +58,9 @@ class RmcFeed:
         self._now_ns = now_ns
         self._pulse_ns: int | None = None
         self._last_slot = -1
+        self._period_ns = round(PERIOD_FACTOR * NS_PER_S / rate_hz)
+        self._early_ns = round(EARLY_PERIODS * NS_PER_S / rate_hz)
+        self._due_ns: int | None = None  # time of the next sentence at the configured rate; None before the first
 
     def on_pulse(self, t_ns: int) -> None:
         """Store a rising edge of the PPS on the device's SIN, at CLOCK_MONOTONIC `t_ns`."""
@@ -72,14 +81,17 @@ class RmcFeed:
         if not rmc.valid:
             return Refusal.NOT_VALID
         slot = rmc.utc_ns * self._rate_hz // NS_PER_S
-        if slot == self._last_slot:
+        now_ns = self._now_ns()
+        due_ns = now_ns if self._due_ns is None else self._due_ns
+        if slot == self._last_slot or now_ns < due_ns - self._early_ns:
             return Refusal.TOO_MANY
-        now_ns, data = self._now_ns(), as_gprmc(sentence)
+        data = as_gprmc(sentence)
         refusal = self._timely(rmc, t_rx_ns, now_ns, now_ns + len(data) * uart_byte_ns(self._port.bit_rate))
         if refusal is None:
             refusal = self._send(data)
         if refusal is None:
             self._last_slot = slot
+            self._due_ns = max(due_ns, now_ns) + self._period_ns
         return refusal
 
     def _timely(self, rmc: Rmc, t_rx_ns: int, now_ns: int, through_ns: int) -> Refusal | None:

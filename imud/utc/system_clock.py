@@ -9,6 +9,7 @@ import asyncio
 import ctypes
 import os
 from collections.abc import Callable
+from functools import cache
 from math import sqrt
 from typing import Final, NamedTuple
 
@@ -55,9 +56,14 @@ class KernelClock(NamedTuple):
         return round(max(self.estimated_error_us, self.most_error_us / sqrt(3)) * NS_PER_US)
 
 
+@cache
+def _libc() -> ctypes.CDLL:
+    return ctypes.CDLL(None, use_errno=True)  # takes longer than the call of adjtimex(2)
+
+
 def ask_kernel(timex: Timex) -> int:
     """Call adjtimex(2): fill `timex` and return the state of the clock. Raises OSError."""
-    state: int = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(timex))
+    state: int = _libc().adjtimex(ctypes.byref(timex))
     if state < 0:
         number = ctypes.get_errno()
         raise OSError(number, os.strerror(number))

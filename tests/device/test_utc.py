@@ -107,7 +107,7 @@ def test_sentences_are_sent_or_refused_and_give_pulses_utc(bench: KeeperBench) -
     bench.port.is_free = True
     bench.second(7, sentence=False)
     bench.source.give(build((UTC_S + 9) * NS_PER_S), bench.now_ns)
-    assert bench.keeper.status().refused == {"busy": 1, "ahead": 1}  # a busy port, and a wrong second
+    assert bench.keeper.status().refused == {"busy": 1, "leap": 1}  # a busy port, and a wrong second
     assert len(bench.written) == 6
 
 
@@ -168,6 +168,52 @@ def test_a_receiver_with_a_wrong_date(
             bench.second(number)
         assert bench.keeper.status().problem == ""
         assert len(bench.written) == 3
+
+
+def test_a_hostile_source_without_a_synchronized_clock(bench: KeeperBench, caplog: pytest.LogCaptureFixture) -> None:
+    """Sentences of rising seconds, then sentences that are in turn correct and wrong."""
+    for second in range(1000):
+        bench.now_ns = BEGIN_NS + second * NS_PER_MS
+        bench.source.give(build((UTC_S + second) * NS_PER_S), bench.now_ns)
+    assert bench.written == [build(UTC_S * NS_PER_S)]
+    assert bench.keeper.status().refused == {"leap": 999}
+    assert "the sentences of test: their time leaps against the clock of the host" in bench.keeper.problem
+    for second in range(1, 30):
+        bench.second(second, pulse=False)
+        bench.source.give(build((UTC_S + 7 * second) * NS_PER_S), bench.now_ns)
+    assert bench.written == [build((UTC_S + second) * NS_PER_S) for second in range(30)]
+    assert len(caplog.records) == 1, "a hostile source must not fill the log"
+
+
+def test_a_leap_that_the_synchronized_clock_confirms() -> None:
+    """The system clock was synchronized after a receiver with a wrong time."""
+    bench = KeeperBench()
+    bench.second(0, pulse=False, off_s=400)
+    bench.system = UtcReference(OFFSET_NS, NS_PER_MS)
+    bench.second(1, pulse=False)
+    assert bench.written[-1] == build((UTC_S + 1) * NS_PER_S)
+
+
+@pytest.mark.parametrize(
+    ("sentence", "problem"),
+    [
+        (b"", "test has sent no time sentence (RMC) for more than 10 s: is the receiver connected and sending?"),
+        (build(UTC_S * NS_PER_S, valid=False), "the time sentences (RMC) of test have no valid time for more than"),
+    ],
+    ids=["no sentence", "status V"],
+)
+def test_silent_receiver_is_a_problem(bench: KeeperBench, sentence: bytes, problem: str) -> None:
+    for second in range(3):
+        bench.second(second)
+    for second in range(3, 30):
+        assert bench.keeper.problem == "" or second > 12
+        bench.second(second, sentence=False)
+        if sentence:
+            bench.source.give(sentence, bench.now_ns)
+    assert bench.keeper.problem.startswith(problem)
+    bench.second(30)
+    bench.keeper.tick(bench.now_ns, None)
+    assert bench.keeper.status().problem == ""
 
 
 def test_a_clock_has_the_reference_of_each_second_from_its_start_to_the_end_of_the_link() -> None:

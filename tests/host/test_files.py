@@ -40,9 +40,9 @@ def test_other_file_types_are_rejected_immediately(make: Callable[[Path], None],
     for path, expected in ((tmp_path / "it", words), ("a\0b", "null")):
         with pytest.raises(OSError, match=expected):
             files.open_regular(path)
-        with pytest.raises(OSError, match=expected) as raised:
+        with pytest.raises(OSError, match=expected) as exception:
             files.read_regular_file(path, 1000)
-        assert re.search(expected, reason_of(raised.value)), "a message must name the type"
+        assert re.search(expected, reason_of(exception.value)), "a message must name the type"
 
 
 def test_a_file_replaced_between_check_and_opening(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -77,9 +77,9 @@ def test_complete_content_up_to_a_limit(tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.write_bytes(b"12345")
     assert files.read_regular_file(path, 5) == b"12345"
-    with pytest.raises(files.FileTooLong) as raised:
+    with pytest.raises(files.FileTooLong) as exception:
         files.read_regular_file(path, 4)
-    assert reason_of(raised.value) == "expected at most 4 bytes, got more"
+    assert reason_of(exception.value) == "expected at most 4 bytes, got more"
 
 
 @pytest.mark.parametrize("failing", ["os.fsync", "os.replace", "os.fchown"])

@@ -10,7 +10,8 @@ import sys
 import threading
 from ipaddress import IPv4Address, IPv4Network
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+from unittest.mock import Mock
 
 import pytest
 
@@ -19,7 +20,7 @@ from imud.host.network import CA_BYTES_MAX, interface_addresses, listen, resolve
 from imud.host.scrape_server import HttpRequest, HttpResponse, ScrapeServer
 from imud.model.errors import ServerError
 from imud.publishers.sentence_ports import TcpOutput, UdpOutput
-from imud.utc.receivers import GpsdSource, RmcOptions
+from imud.utc.receivers import RmcOptions, SourceContext, make_gpsd
 from tests.support.daemon_process import LIMIT_S
 from tests.support.event_loops import VirtualClock, in_loop
 
@@ -67,7 +68,8 @@ async def test_a_name_server_is_silent(monkeypatch: pytest.MonkeyPatch, caplog: 
         raise socket.gaierror(socket.EAI_AGAIN, "Temporary failure in name resolution")
 
     monkeypatch.setattr(socket, "getaddrinfo", silent)
-    source = GpsdSource(RmcOptions(source="gpsd", host="gps.example"), lambda: 0)
+    context = cast(SourceContext, Mock(cpu_ns=int, now_ns=int))
+    source = make_gpsd(RmcOptions(source="gpsd", host="gps.example"), context)
     source.start(lambda _sentence, _t_rx_ns: None)
     given_up, waiting = (asyncio.create_task(resolve("gps.example", 2947)) for _ in range(2))
     while len(threads) < 3:

@@ -10,7 +10,7 @@ import subprocess
 import time
 import tracemalloc
 from collections.abc import Awaitable, Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from random import Random
 from unittest.mock import AsyncMock
@@ -21,8 +21,9 @@ import pytest
 from imud.contracts.link import OnData, OnEnd
 from imud.contracts.status import KernelCounters
 from imud.formats.nmea0183 import Rmc, build, checksum, parse
+from imud.host import peer_stream
 from imud.model.errors import LinkError, LinkMissing
-from imud.model.units import NS_PER_S
+from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.utc import RMC_SOURCES, receivers
 from imud.utc.system_clock import SystemClockSource
 from tests.support.daemon_process import running_daemon
@@ -34,6 +35,7 @@ from tests.support.surroundings import free_port
 
 SENTENCES = [build((1_795_000_000 + n) * NS_PER_S) for n in range(5)]
 VERSION = b'{"class":"VERSION","release":"3.22","rev":"3.22","proto_major":3,"proto_minor":14}\r\n'
+CONTEXT = receivers.SourceContext(lambda *_: Port(), time.monotonic_ns, lambda: 0, lambda: 0)
 Serve = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 Scene = Callable[[receivers.GpsdSource, Sentences], Awaitable[None]]
 
@@ -51,7 +53,7 @@ def play(serve: Serve, scene: Scene, gps: str = "", retry: receivers.Retry | Non
         sentences = Sentences()
         source = receivers.GpsdSource(
             receivers.RmcOptions(source="gpsd", tcp_port=port, gps=gps),
-            time.monotonic_ns,
+            CONTEXT,
             retry or receivers.Retry(soon),
         )
         async with server:
@@ -70,7 +72,7 @@ def play(serve: Serve, scene: Scene, gps: str = "", retry: receivers.Retry | Non
 def test_it_asks_for_nmea_and_gives_rmc_with_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """The second address of the host accepts the connection."""
     addresses = AsyncMock(return_value=["127.0.0.2", "127.0.0.1", "127.0.0.3"])
-    monkeypatch.setattr(receivers, "resolve", addresses)
+    monkeypatch.setattr(peer_stream, "resolve", addresses)
     asked: list[bytes] = []
     ended = asyncio.Event()
 
@@ -85,8 +87,8 @@ def test_it_asks_for_nmea_and_gives_rmc_with_its_time(monkeypatch: pytest.Monkey
     async def scene(source: receivers.GpsdSource, sentences: Sentences) -> None:
         await sentences.until(lambda: len(sentences.got) == 2)
         assert (source.problem, source.sentences) == ("", 2)
-        assert source._writer is not None
-        sock = source._writer.get_extra_info("socket")
+        assert source._stream is not None
+        sock = source._stream.get_extra_info("socket")
         assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
         probes = (socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT)
         assert [sock.getsockopt(socket.IPPROTO_TCP, option) for option in probes] == [10, 5, 3]  # a loss shows in 25 s
@@ -138,7 +140,7 @@ async def test_an_unreachable_server_is_reported_and_retried() -> None:
         await asyncio.sleep(0)
 
     options = receivers.RmcOptions(source="gpsd", tcp_port=port)
-    source = receivers.GpsdSource(options, time.monotonic_ns, receivers.Retry(sleep))
+    source = receivers.GpsdSource(options, CONTEXT, receivers.Retry(sleep))
     source.start(Sentences())
     async with asyncio.timeout(LIMIT_S):
         await paused.wait()
@@ -150,7 +152,7 @@ async def test_an_unreachable_server_is_reported_and_retried() -> None:
 def test_a_server_that_does_not_answer_is_retried_after_5_s(monkeypatch: pytest.MonkeyPatch) -> None:
     clock, paused_s = VirtualClock(), list[float]()
 
-    async def connect(*_address: object) -> None:
+    async def connect(*_address: object, **_options: object) -> None:
         await asyncio.sleep(60)
 
     async def sleep(_seconds: float) -> None:
@@ -164,7 +166,9 @@ def test_a_server_that_does_not_answer_is_retried_after_5_s(monkeypatch: pytest.
 
     monkeypatch.setattr(asyncio, "open_connection", connect)
     begin_ns = clock.now_ns()
-    source = receivers.GpsdSource(receivers.RmcOptions(source="gpsd"), clock.now_ns, receivers.Retry(sleep))
+    source = receivers.GpsdSource(
+        receivers.RmcOptions(source="gpsd"), CONTEXT._replace(now_ns=clock.now_ns), receivers.Retry(sleep)
+    )
     run_virtually(clock, scene())
     assert paused_s == [pytest.approx(5, abs=0.1)]
     assert source.problem == "cannot connect to gpsd at 127.0.0.1:2947: no answer; is gpsd running?"
@@ -180,6 +184,7 @@ class Port:
 
     def __init__(self, refusals: int = 0) -> None:
         self.opened = self.closed = 0
+        self.pauses = self.resumes = 0
         self.on_data: OnData | None = None
         self.on_end: OnEnd | None = None
         self.started = asyncio.Event()
@@ -202,8 +207,12 @@ class Port:
         self.started.set()
 
     def deliver_to(self, on_data: OnData) -> None: ...
-    def pause(self) -> None: ...
-    def resume(self) -> None: ...
+
+    def pause(self) -> None:
+        self.pauses += 1
+
+    def resume(self) -> None:
+        self.resumes += 1
 
     def take(self) -> bytes:
         return b""
@@ -225,7 +234,7 @@ class Port:
 @in_loop
 async def test_sentences_come_with_the_time_of_their_last_byte() -> None:
     port, sentences = Port(), Sentences()
-    source = receivers.NmeaPortSource(port, receivers.Retry(soon))
+    source = receivers.NmeaPortSource(port, CONTEXT, receivers.Retry(soon))
     source.start(sentences)
     async with asyncio.timeout(LIMIT_S):
         await port.started.wait()
@@ -243,7 +252,7 @@ async def test_sentences_come_with_the_time_of_their_last_byte() -> None:
 @in_loop
 async def test_a_port_that_goes_away_or_is_held_is_opened_again() -> None:
     port, sentences = Port(refusals=3), Sentences()
-    source = receivers.NmeaPortSource(port, receivers.Retry(soon))
+    source = receivers.NmeaPortSource(port, CONTEXT, receivers.Retry(soon))
     source.start(sentences)
     async with asyncio.timeout(LIMIT_S):
         await port.started.wait()
@@ -285,6 +294,89 @@ def test_sources_by_their_name_and_documented_values() -> None:
         receivers.RmcOptions(source="gpsd", host="a b")
     with pytest.raises(ValueError, match=r"^expected the key port for source nmea, "):
         receivers.RmcOptions(source="nmea")
+
+
+SENTENCES_PER_READ = peer_stream.READ_BYTES // len(SENTENCES[0]) + 1
+
+
+class CountedCpu:
+    """CPU time that advances by 1 ms for each sentence."""
+
+    def __init__(self) -> None:
+        self.sentences = 0
+
+    def __call__(self) -> int:
+        return self.sentences * NS_PER_MS
+
+    def take(self, _sentence: bytes, _t_rx_ns: int) -> None:
+        self.sentences += 1
+
+
+def test_gpsd_that_floods_waits_for_the_next_tick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Time and CPU time are virtual: 50 ms of CPU time at the start, and 50 ms per second."""
+    monkeypatch.setattr(peer_stream, "resolve", AsyncMock(return_value=["127.0.0.1"]))
+    clock, cpu = VirtualClock(), CountedCpu()
+    flood = b"".join(SENTENCES) * 20_000  # 7 MB
+    sent_bytes = 0
+    connection_end = asyncio.Event()
+
+    async def serve(_reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        nonlocal sent_bytes
+        with suppress(OSError):
+            for start in range(0, len(flood), 65536):
+                writer.write(flood[start : start + 65536])
+                await writer.drain()
+                sent_bytes += 65536
+        writer.transport.abort()
+        connection_end.set()
+
+    async def scene() -> None:
+        server = await asyncio.start_server(serve, "127.0.0.1", 0)
+        options = receivers.RmcOptions(source="gpsd", tcp_port=server.sockets[0].getsockname()[1])
+        context = CONTEXT._replace(now_ns=clock.now_ns, cpu_ns=cpu)
+        source = receivers.GpsdSource(options, context, receivers.Retry(soon))
+        async with server:
+            source.start(cpu.take)
+            while not cpu.sentences:
+                await asyncio.sleep(0)
+            start_ns = clock.now_ns()
+            while clock.now_ns() - start_ns < 10 * NS_PER_S:
+                await asyncio.sleep(0.05)
+            budget = 50 + 10 * 50  # sentences
+            assert budget - SENTENCES_PER_READ <= cpu.sentences <= budget + SENTENCES_PER_READ
+            assert "gpsd at 127.0.0.1" in source.problem
+            assert "sends more than imud processes" in source.problem
+            assert sent_bytes < len(flood) - 65536, "the kernel stops the server"
+            source.close()
+            await connection_end.wait()
+
+    run_virtually(clock, scene())
+
+
+@in_loop
+async def test_port_that_floods_is_paused() -> None:
+    port, cpu = Port(), CountedCpu()
+    now_ns = 0
+    source = receivers.NmeaPortSource(port, CONTEXT._replace(now_ns=lambda: now_ns, cpu_ns=cpu))
+    source.start(cpu.take)
+    async with asyncio.timeout(LIMIT_S):
+        await port.started.wait()
+        assert port.on_data
+        for _ in range(50):
+            port.on_data(SENTENCES[0], now_ns)
+        assert (cpu.sentences, port.pauses, source.problem) == (50, 0, "")
+        port.on_data(SENTENCES[0], now_ns)
+        assert (cpu.sentences, port.pauses) == (50, 1)
+        assert source.problem.startswith("NMEA receiver on /dev/ttyGNSS sends more than imud processes: 1 inputs")
+        while not port.resumes:
+            await asyncio.sleep(0.01)
+        now_ns = NS_PER_S // 10
+        port.on_data(SENTENCES[0], now_ns)
+        assert cpu.sentences == 51
+    for _ in range(5):
+        port.on_data(SENTENCES[0], now_ns)
+    source.close()  # also cancels the end of the pause
+    assert port.pauses == 2
 
 
 GGA = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"

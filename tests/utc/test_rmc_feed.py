@@ -1,6 +1,7 @@
 """Feed of sentences: transmission time, rejected sentences with their reasons, and a device that becomes UTC."""
 
 from itertools import pairwise
+from random import Random
 
 import pytest
 
@@ -70,6 +71,29 @@ def test_sentences_are_passed_on_at_once_up_to_the_rate() -> None:
     bench.broken = False
     assert bench.give(0, 0.3) == ""
     assert len(bench.sent) == 1
+
+
+@pytest.mark.parametrize("rate_hz", [1, 2, 5, 10])
+@pytest.mark.parametrize("reference", [None, GOOD])
+def test_rate_counts_real_time(rate_hz: int, reference: UtcReference | None) -> None:
+    """A hostile source sends 100 sentences per second, each with another time."""
+    bench = FeedBench(rate_hz, reference)
+    for index in range(2000):
+        bench.give(index // 100 + index % 7 / 7 + index, index / 100)
+        bench.give(index // 100 + index % 10 / 10, index / 100)
+    assert bench.feed.sent <= 20 * rate_hz * 1.02 + 1
+    assert bench.feed.sent + sum(bench.feed.refused.values()) == 4000
+
+
+@pytest.mark.parametrize("rate_hz", [1, 5])
+def test_rate_permits_jitter_and_drift(rate_hz: int) -> None:
+    """The delay of a sentence changes by a third of a period, the oscillator of the host is 200 ppm slow."""
+    bench = FeedBench(rate_hz, None)
+    random = Random(1)
+    for index in range(5000):
+        period_s = 1 / rate_hz
+        delay_s = random.uniform(0.1, 0.43) * period_s
+        assert bench.give(index * period_s, (index * period_s) * (1 - 200e-6) + delay_s) == ""
 
 
 @pytest.mark.parametrize(

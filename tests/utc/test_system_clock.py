@@ -38,10 +38,14 @@ def test_the_kernel_answers_sensibly_and_a_refused_call_means_not_synchronized()
     assert system_clock.system_reference(system_clock.KernelClock(False, 1, NS_PER_MS), 42) is None
 
 
-def test_a_state_of_the_kernel_is_returned_and_a_failed_call_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_state_of_the_kernel_is_returned_and_a_failed_call_is_an_error(
+    monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
     states = iter((0, 5, -1))
     called = SimpleNamespace(adjtimex=lambda _timex: next(states))
     monkeypatch.setattr(ctypes, "CDLL", lambda _name, *, use_errno: called if use_errno else None)
+    system_clock._libc.cache_clear()
+    request.addfinalizer(system_clock._libc.cache_clear)
     assert [system_clock.ask_kernel(system_clock.Timex()) for _ in range(2)] == [0, 5]
     ctypes.set_errno(errno.EPERM)
     with pytest.raises(PermissionError, match="not permitted"):
