@@ -1,6 +1,7 @@
 """TCP and UDP sockets for an IP address, and addresses of a host name."""
 
 import fcntl
+import re
 import socket
 import struct
 from array import array
@@ -107,7 +108,7 @@ def _interface_address(requester: socket.socket, entry: bytes) -> InterfaceAddre
 
 
 CA_BYTES_MAX: Final = 1 << 20  # maximum length of a file with CA certificates, bytes. All CAs of Debian need 220 kB.
-PEM_CERTIFICATE: Final = "-----BEGIN"  # start of a certificate in PEM
+PEM_CERTIFICATE: Final = re.compile("-----BEGIN CERTIFICATE-----.*?-----END CERTIFICATE-----", re.DOTALL)
 
 
 def tls_context(ca_file: str | None) -> "ssl.SSLContext":
@@ -121,12 +122,27 @@ def tls_context(ca_file: str | None) -> "ssl.SSLContext":
     """
     import ssl
 
-    certificates: str | None = None
-    if ca_file is not None:
-        content = read_regular_file(ca_file, CA_BYTES_MAX)
-        certificates = content.decode("latin-1").encode("ascii", "replace").decode("ascii")  # comments in UTF-8
-        if PEM_CERTIFICATE not in certificates:  # with empty data, Python would trust all CAs of the system
-            raise ssl.SSLError(NO_ERRNO, "expected certificates (PEM), got a file without a certificate")
+    certificates = None if ca_file is None else _read_certificates(ca_file)
     context = ssl.create_default_context(cadata=certificates)
     context.verify_flags &= ~ssl.VERIFY_X509_STRICT
     return context
+
+
+def certificates_of(ca_file: str | None) -> frozenset[bytes]:
+    """Return the certificates of a file (DER); none for None. Raises OSError as `tls_context`."""
+    import ssl
+
+    if ca_file is None:
+        return frozenset()
+    return frozenset(map(ssl.PEM_cert_to_DER_cert, PEM_CERTIFICATE.findall(_read_certificates(ca_file))))
+
+
+def _read_certificates(ca_file: str) -> str:
+    """Return the content of a file with at least one certificate (PEM). Raises OSError."""
+    import ssl
+
+    content = read_regular_file(ca_file, CA_BYTES_MAX).decode("latin-1")
+    text = content.encode("ascii", "replace").decode("ascii")  # comments in UTF-8
+    if PEM_CERTIFICATE.search(text) is None:  # with empty data, Python would trust all CAs of the system
+        raise ssl.SSLError(NO_ERRNO, "expected certificates (PEM), got a file without a certificate")
+    return text

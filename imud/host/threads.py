@@ -37,7 +37,7 @@ def call_in_thread(name: str, function: Callable[[], T]) -> "asyncio.Future[T]":
     """Call a function in a new daemon thread, and return its result or its exception. Needs a running event loop.
 
     A function that hangs (a silent name server, a file on a dead network disk) delays neither the end of the process
-    nor other calls. A thread of the event loop's executor would delay both, because a program cannot cancel the function.
+    nor other calls. A thread of the event loop's executor would delay both, because a program cannot cancel the call.
     """
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()

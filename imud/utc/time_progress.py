@@ -5,7 +5,7 @@ host's oscillator. A time that leaps is wrong: a hostile or faulty server, or a 
 knows UTC from another source, other checks follow. Without another source, this check is the only one.
 
 A new time becomes the accepted time after 10 s without a contradiction: the receiver has got its leap seconds, another
-receiver has taken over, or the host was suspended (CLOCK_MONOTONIC then stands still).
+receiver has taken over, or the host was suspended (CLOCK_MONOTONIC then does not advance).
 """
 
 from typing import Final

@@ -25,12 +25,12 @@ class Cpu:
 
 @asynccontextmanager
 async def connected(serve: Serve, cpu: Cpu) -> AsyncIterator[tuple[PeerStream, WorkBudget]]:
-    ended = asyncio.Event()
+    connection_end = asyncio.Event()
 
     async def serve_and_close(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await serve(reader, writer)
         writer.close()
-        ended.set()
+        connection_end.set()
 
     budget = WorkBudget(WorkLimits(), cpu)
     server = await asyncio.start_server(serve_and_close, "127.0.0.1", 0)
@@ -39,7 +39,7 @@ async def connected(serve: Serve, cpu: Cpu) -> AsyncIterator[tuple[PeerStream, W
         stream = await open_peer_stream("127.0.0.1", port, "the server", budget, lambda: 0)
         yield stream, budget
         await stream.close()
-        await ended.wait()
+        await connection_end.wait()
 
 
 @in_loop

@@ -1,6 +1,9 @@
 """Output `signalk`: deltas of one device for a Signal K server.
 
 publisher   deltas from samples
-server      access request, WebSocket and verification
+server      access request, token and verification
+client      HTTP requests and WebSocket, within a work budget
+http_reply  parser of a reply
+websocket   frames
 settings    options and row of the output
 """

@@ -44,14 +44,14 @@ class SignalKOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Options of the output `signalk`."""
 
     enabled: bool = False
-    """Send to a Signal K server. Needs the extra `imud[signalk]`."""
+    """Send to a Signal K server."""
     device: str | None = None
     """Name of the device; null: the only device of the configuration."""
     url: str = "http://127.0.0.1:3000"
     """Server: `http://HOST:PORT`, or `https://HOST:PORT` (TLS)."""
     ca_file: str | None = None
-    """CA certificates (PEM) for `https`, or the server's own certificate; null: the certificates that the system
-    trusts."""
+    """CA certificates (PEM) for `https`, or a copy of the server's own certificate; null: the certificates that the
+    system trusts."""
     rate_hz: RateHz = 10.0
     """Deltas per second. Variation, temperature and pressure follow at most once per second."""
 

@@ -1,6 +1,5 @@
 """Deltas: values, signs and units by hand, choice of the device, rates and time stamps."""
 
-from dataclasses import replace
 from math import inf, nan, radians
 from typing import Any
 from unittest.mock import Mock
@@ -13,9 +12,8 @@ from imud.attitude.published import PublishedAxes, published_frame
 from imud.contracts.lines import UtcReference
 from imud.contracts.publisher import AS_SENT, Batch
 from imud.contracts.status import FrameStatus, OutputStatus
-from imud.model.errors import ServerError
 from imud.model.sample import Sample, Sync, Vector3
-from imud.model.units import NS_PER_MS
+from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.publishers.signalk import publisher
 from imud.publishers.signalk.settings import SignalKOptions
 from tests.support.event_loops import VirtualClock
@@ -40,7 +38,8 @@ class Deltas:
         self.context = publisher_context(
             lambda: statuses, 1, self.clock.now_ns, latencies=self.asked, utc_reference=lambda: utc
         )
-        self.server = Mock(status=lambda: OutputStatus("http://127.0.0.1:3000", 0, 0, 1, ""))
+        status = OutputStatus("http://127.0.0.1:3000", 0, 0, 1, "")
+        self.server = Mock(status=lambda: status, connections=1, is_open=True)
         monkeypatch.setattr(publisher, "SignalKServer", Mock(return_value=self.server))
         self.output = publisher.SignalK(SignalKOptions(**settings), self.context)
         self.output.start()
@@ -173,9 +172,89 @@ def test_the_output_uses_one_device_and_closes(monkeypatch: pytest.MonkeyPatch) 
     bench.server.close.assert_called()
 
 
-def test_without_aiohttp_the_output_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
-    output = publisher.SignalK(SignalKOptions(), replace(publisher_context(), state_dir=None))
-    with pytest.raises(ServerError, match=r"cannot import aiohttp; .* signalk: .* install 'imud\[signalk\]'$"):
-        output.start()
-    output.close()
+def advance(bench: Deltas, seconds: float) -> None:
+    """Let time pass with ticks at 2 Hz."""
+    for _ in range(round(seconds * 2)):
+        bench.clock.advance(NS_PER_S // 2)
+        bench.output.tick(bench.clock.now_ns())
+
+
+def test_stale_values_are_null_once_on_each_connection(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Deltas(monkeypatch, declination_deg=None)
+    bench.publish(euler_rad=LEFT_45, temperature_c=25.0)
+    assert set(bench.values()) == {
+        "navigation.attitude",
+        "navigation.headingTrue",
+        "environment.inside.imu.temperature",
+    }
+    advance(bench, 1.0)
+    assert bench.taken() == []
+    advance(bench, 1.0)
+    assert bench.values() == {"navigation.attitude": None, "navigation.headingTrue": None}
+    advance(bench, 3.0)  # the temperature follows once per second
+    assert bench.values() == {"environment.inside.imu.temperature": None}
+    advance(bench, 10.0)
+    assert bench.taken() == []
+    bench.server.connections += 1  # the server restarted
+    advance(bench, 10.0)
+    assert len(bench.values()) == 3
+    bench.seq += 100
+    bench.publish(euler_rad=LEFT_45)
+    assert bench.values()["navigation.headingTrue"] == near(45)
+    advance(bench, 2.0)
+    assert bench.values() == {"navigation.attitude": None, "navigation.headingTrue": None}
+
+
+def test_values_that_the_device_stops_sending(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Deltas(monkeypatch, declination_deg=None)
+    for index in range(8):
+        bench.seq += 499
+        bench.publish(euler_rad=LEFT_45, heave_m=0.1 if index < 2 else None)
+        advance(bench, 0.5)
+    bench.output.remove_device("bow")
+    values = [value for _, _, update in bench.taken() for value in update["values"]]
+    assert [value["value"] for value in values if value["path"] == "environment.heave"] == [0.1, 0.1, None]
+    advance(bench, 5.0)
+    assert bench.values() == {"navigation.attitude": None, "navigation.headingTrue": None}
+
+
+def test_without_a_connection_null_follows_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Deltas(monkeypatch, declination_deg=None)
+    bench.publish(gyro_rad_s=(0.0, 0.0, 0.0))
+    bench.taken()
+    bench.server.is_open = False
+    advance(bench, 10.0)
+    assert bench.taken() == []
+    bench.server.is_open = True
+    bench.server.connections += 1
+    advance(bench, 0.5)
+    assert bench.values() == {"navigation.rateOfTurn": None}
+
+
+@pytest.mark.parametrize(("rate_hz", "timeout_s"), [(10.0, 1), (1.0, 3), (0.1, 30)])
+def test_timeout_follows_the_period(monkeypatch: pytest.MonkeyPatch, rate_hz: float, timeout_s: int) -> None:
+    bench = Deltas(monkeypatch, rate_hz=rate_hz)
+    samples = round(1000 / rate_hz)
+    for _ in range(3):
+        bench.publish(samples, gyro_rad_s=(0.0, 0.0, 0.0))
+    metas = [update.get("meta", []) for _, _, update in bench.taken()]
+    expected = {"navigation.rateOfTurn": timeout_s, "navigation.magneticVariation": max(timeout_s, 3)}
+    assert {meta["path"]: meta["value"]["timeout"] for meta in metas[0]} == expected
+    assert not any(metas[1:]), "the server knows the timeouts"
+    bench.server.connections += 1
+    bench.publish(samples, gyro_rad_s=(0.0, 0.0, 0.0))
+    ((_, _, update),) = bench.taken()
+    assert update["meta"][0] == {"path": "navigation.rateOfTurn", "value": {"timeout": timeout_s}}
+
+
+def test_timeout_of_a_slow_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Deltas(monkeypatch, declination_deg=None, rate_hz=10.0)
+    for _ in range(5):
+        bench.seq += 1999  # 0.5 Hz
+        bench.publish(gyro_rad_s=(0.0, 0.0, 0.0))
+    metas = [meta for _, _, update in bench.taken() for meta in update.get("meta", [])]
+    assert [meta["value"]["timeout"] for meta in metas] == [1, 6]
+    advance(bench, 5.5)
+    assert bench.taken() == []
+    advance(bench, 1.0)
+    assert bench.values() == {"navigation.rateOfTurn": None}

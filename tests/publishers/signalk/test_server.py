@@ -8,6 +8,7 @@ import shutil
 import ssl
 import stat
 import subprocess
+import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import replace
@@ -26,7 +27,7 @@ from imud.model.sample import Sample, Sync
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.publishers.signalk import server as module
 from imud.publishers.signalk.publisher import SignalK, delta
-from imud.publishers.signalk.server import DENIED, QUEUE_MAX, WAITING, SignalKServer
+from imud.publishers.signalk.server import DENIED, QUEUE_MAX, REJECTIONS_MAX, WAITING, SignalKServer
 from imud.publishers.signalk.settings import SignalKOptions
 from tests.fleet.authority import Authority
 from tests.support.event_loops import VirtualClock
@@ -133,13 +134,13 @@ class Bench:
 
     def __init__(self, folder: Path) -> None:
         self.fake, self.folder = FakeSignalK(), folder
-        self.scheme, self.ca_file = "http", None
+        self.clock = publisher_context(now_ns=time.monotonic_ns).clock
         self.server: SignalKServer | None = None
         self.sent = 0
 
     def start(self, host: str = "127.0.0.1", ca_file: str | None = None) -> SignalKServer:
         url = f"{'http' if ca_file is None else 'https'}://{host}:{self.fake.port}"
-        self.server = SignalKServer(SignalKOptions(url=url, ca_file=ca_file), self.folder)
+        self.server = SignalKServer(SignalKOptions(url=url, ca_file=ca_file), self.folder, self.clock)
         self.server.start()
         return self.server
 
@@ -177,9 +178,10 @@ class Bench:
 @asynccontextmanager
 async def bench_in(folder: Path) -> AsyncIterator[Bench]:
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("POLL_S", "VERIFY_FIRST_S", "RETRY_FIRST_S", "CLOSE_S"):
+        for name in ("POLL_S", "VERIFY_FIRST_S", "RETRY_FIRST_S"):
             patch.setattr(module, name, SHORT_S)
         patch.setattr(module, "VERIFY_S", 5 * SHORT_S)
+        patch.setattr(module, "UNSTORED_S", 5 * SHORT_S)
         patch.setattr(module, "RETRY_MOST_S", 4 * SHORT_S)
         bench = Bench(folder)
         async with bench.fake.running():
@@ -251,15 +253,48 @@ async def test_a_lost_request_is_repeated_with_the_same_client(bench: Bench) -> 
 
 
 @with_server
-async def test_three_rejections_discard_the_token(bench: Bench) -> None:
+async def test_a_rejected_token_is_kept_and_tried_again(bench: Bench) -> None:
+    """A server that starts rejects valid tokens for some seconds."""
+    bench.fake.permission = "APPROVED"
+    bench.start()
+    await bench.until_problem("")
+    bench.fake.tokens, bench.fake.permission = set(), "PENDING"
+    bench.fake.seen.clear()
+    await bench.until_problem("rejects the token; imud keeps the token and tries it again")
+    await bench.until(lambda: len(bench.fake.seen) == REJECTIONS_MAX - 1)
+    assert len(bench.fake.requests) == 1
+    bench.fake.tokens = {TOKEN}
+    await bench.until_problem("")
+    assert (len(bench.fake.requests), bench.kept["token"]) == (1, TOKEN)
+
+
+@with_server
+async def test_a_revoked_token_gets_a_new_access_request(bench: Bench) -> None:
     bench.fake.permission = "APPROVED"
     bench.start()
     await bench.until_problem("")
     bench.fake.tokens, bench.fake.permission = set(), "PENDING"  # an administrator revokes the token
     bench.fake.seen.clear()
     await bench.until_problem(WAITING)
-    assert (len(bench.fake.requests), "rejects the token" in bench.problem) == (2, False)
-    assert len(bench.fake.seen) == 3, "one read of the values, two connections"
+    assert len(bench.fake.seen) >= REJECTIONS_MAX
+    rejections = len(bench.fake.seen)
+    await bench.until(lambda: len(bench.fake.seen) > rejections + 3)
+    assert (len(bench.fake.requests), bench.kept["token"]) == (2, TOKEN), "imud tries the old token again"
+    bench.fake.tokens = {TOKEN}
+    await bench.until_problem("")
+    await bench.stop()
+    assert bench.kept["href"] == "", "imud forgets the request, because the old token is valid"
+
+
+@with_server
+async def test_a_denied_request_ends_a_rejected_token(bench: Bench) -> None:
+    bench.fake.permission = "APPROVED"
+    server = bench.start()
+    await bench.until_problem("")
+    bench.fake.tokens, bench.fake.permission = set(), "DENIED"
+    await bench.until_problem(DENIED)
+    assert server._task is not None
+    await server._task
 
 
 @with_server
@@ -277,10 +312,22 @@ async def test_values_that_the_server_does_not_store_are_a_problem(bench: Bench)
     bench.fake.permission, bench.fake.can_write = "APPROVED", False  # approved with "Read Only"
     server = bench.start()
     await bench.until_problem("does not store the values of imud.bow; give imud the permission Read/Write")
-    assert server.status().readers == 1, "the connection remains"
-    await bench.until(lambda: not server.status().readers)
+    status = server.status()
+    assert (status.readers, server.connections) == (0, 1), "connected, but no value is delivered"
+    await bench.until(lambda: server.connections > 1)
     bench.fake.can_write = True
     await bench.until_problem("")
+    assert server.status().readers == 1
+
+
+@with_server
+async def test_a_server_that_stops_storing_is_a_problem(bench: Bench) -> None:
+    bench.fake.permission = "APPROVED"
+    server = bench.start()
+    await bench.until_problem("")
+    bench.fake.can_write = False
+    await bench.until_problem("does not store the values")
+    assert server.status().readers == 0
 
 
 @with_server
@@ -370,7 +417,10 @@ async def test_https_needs_a_trusted_certificate(bench: Bench, tmp_path: Path) -
     context.load_cert_chain(authority["broker.pem"], authority["broker.key"])
     bench.fake.port, bench.fake.permission = 0, "APPROVED"
     async with bench.fake.running(context):
-        for ca_file, words in ((authority["gateway.pem"], "certificate"), (str(tmp_path / "no"), "No such file")):
+        for ca_file, words in (
+            (authority["gateway.pem"], "set signalk.url to a name in the certificate"),
+            (str(tmp_path / "no"), "No such file"),
+        ):
             bench.start(ca_file=ca_file)
             await bench.until_problem(words)
             await bench.stop()
@@ -448,6 +498,13 @@ def motion(seq: int) -> Batch:
     return Batch("bow", 0, [sample])
 
 
+async def attitude_is_null(output: SignalK, admin: Admin) -> None:
+    """Let the device be silent for 2 s, and wait until the server has `null`."""
+    output.tick(VirtualClock().now_ns() + 2 * NS_PER_S)
+    while (await admin.do("GET", "/signalk/v1/api/vessels/self/navigation/attitude"))["value"] is not None:
+        await asyncio.sleep(0.02)
+
+
 @pytest.mark.live
 @pytest.mark.timeout(180)
 @pytest.mark.skipif(bool(NO_SERVER), reason=NO_SERVER)
@@ -491,12 +548,15 @@ async def test_the_rest_api_of_a_real_server_shows_the_values(tmp_path: Path, mo
             while not {"inside", "outside"} <= found.get("environment", {}).keys():  # sent once per second
                 await publish()
                 found = await admin.do("GET", "/signalk/v1/api/vessels/self")
+            meta = await admin.do("GET", "/signalk/v1/api/vessels/self/navigation/headingTrue/meta")
+            await attitude_is_null(output, admin)
             await admin.do("DELETE", f"/skServer/security/devices/{name}")  # revoke the token
             await publish_until(WAITING)
         task = output._server._task
         output.close()
         assert task is not None
         await asyncio.gather(task, return_exceptions=True)
+    assert meta["timeout"] == 1
     navigation, inside = found["navigation"], found["environment"]["inside"]["imu"]
     assert navigation["attitude"]["$source"] == SOURCE
     assert {name: round(value, 6) for name, value in navigation["attitude"]["value"].items()} == {
