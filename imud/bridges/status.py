@@ -175,7 +175,7 @@ def utc(status: UtcStatus) -> str:
     if status.pulses or status.pulses_ignored:
         words.append(f"{status.pulses} pulses, {status.pulses_ignored} ignored")
     if status.chrony_sent or status.chrony_refused:
-        words.append(f"chronyd accepted {status.chrony_sent}, refused {status.chrony_refused}")
+        words.append(f"sent to chronyd {status.chrony_sent}, refused {status.chrony_refused}")
     return ("; ".join(words) or "no pulse and no sentence yet") + (f" ({status.problem})" if status.problem else "")
 
 

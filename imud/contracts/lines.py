@@ -150,6 +150,9 @@ class PpsOptions(InputOptions, frozen=True, kw_only=True, forbid_unknown_fields=
     chrony: str = ""
     """Socket of chronyd that receives the pulses, for example `/run/chrony.imud.sock`; empty: none. Without `rmc`,
     chronyd needs another source for the second."""
+    chrony_sample_bytes: Literal[32, 40] | None = None
+    """Length of a sample for chronyd: 32 for a chronyd with a 32-bit `time_t`, otherwise 40; null: imud reads the
+    program of chronyd."""
 
 
 class ReadyOptions(InputOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):

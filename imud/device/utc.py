@@ -23,7 +23,8 @@ from imud.model.sample import Sample
 from imud.model.units import NS_PER_S
 from imud.sampling.clock import SampleClock
 from imud.utc import RMC_SOURCES
-from imud.utc.pps import ChronyFeed, PpsReference
+from imud.utc.chrony import ChronyFeed
+from imud.utc.pps import PpsReference
 from imud.utc.receivers import RmcSource, SourceContext
 from imud.utc.rmc_feed import Refusal, RmcFeed
 from imud.utc.system_clock import kernel_clock, system_reference
@@ -248,7 +249,9 @@ def make_utc_feed(config: DeviceConfig, port: DeviceLink, host: HostClock) -> Ut
     rmc, pps = config.rmc, config.lines.pps if config.lines is not None else None
     if rmc is None and pps is None:
         return None
-    chrony = ChronyFeed(pps.chrony, host.utc_offset_ns) if pps is not None and pps.chrony else None
+    chrony = None
+    if pps is not None and pps.chrony:
+        chrony = ChronyFeed(pps.chrony, host.utc_offset_ns, pps.chrony_sample_bytes)
 
     def system() -> UtcReference | None:
         return system_reference(kernel_clock(), host.utc_offset_ns())

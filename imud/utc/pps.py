@@ -10,11 +10,7 @@ early. imud rejects these pulses:
 - The second of a pulse is known after two consecutive sentences with the same second. It is corrected in the same way.
 """
 
-import socket
-import struct
 from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
 from itertools import combinations, pairwise
 from math import hypot
 from statistics import median, quantiles
@@ -135,53 +131,3 @@ class PpsReference:
         seconds = round((t_ns - before_ns) / NS_PER_S)
         off_ns = abs(t_ns - before_ns - seconds * NS_PER_S)
         return seconds if 1 <= seconds <= GAP_S_MAX and off_ns <= seconds * STEP_TOLERANCE_NS else 0
-
-
-MAGIC: Final = 0x534F434B
-SAMPLE: Final = struct.Struct("=qqdiiii")
-HALF_NS: Final = NS_PER_S // 2
-
-
-def encode(system_ns: int, offset_ns: int, *, pulse: bool, leap: int = 0) -> bytes:
-    """Encode a sample for chronyd: at `system_ns`, true time was `offset_ns` later (`pulse`: modulo 1 s)."""
-    seconds, rest_ns = divmod(system_ns, NS_PER_S)
-    return SAMPLE.pack(seconds, rest_ns // NS_PER_US, offset_ns / NS_PER_S, pulse, leap, 0, MAGIC)
-
-
-class ChronyFeed:
-    """Sender of samples to chronyd. It never blocks. Synchronization: one thread."""
-
-    def __init__(self, path: str, utc_offset_ns: Callable[[], int]) -> None:
-        """`path` is chronyd's socket, which may not exist yet. `utc_offset_ns`: see `SourceContext.utc_offset_ns`."""
-        self.title = f"chronyd at {path}"
-        # reason why chronyd did not accept the last sample, one sentence; empty if it accepted the sample
-        self.problem = ""
-        self.sent = 0
-        self.refused = 0  # number of samples that chronyd did not accept: it is not running, or it is too slow
-        self._path = path
-        self._utc_offset_ns = utc_offset_ns
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
-
-    def send_pulse(self, t_ns: int, unix_s: int | None = None) -> bool:
-        """Send a pulse at CLOCK_MONOTONIC `t_ns`, the start of `unix_s` if known. Return whether chronyd accepted it.
-        Call this method soon after the pulse. Without the second, chronyd needs another source for it (`lock`)."""
-        system_ns = t_ns + self._utc_offset_ns()
-        second_s = (system_ns + HALF_NS) // NS_PER_S if unix_s is None else unix_s
-        offset_ns = second_s * NS_PER_S - system_ns
-        return self._send(encode(system_ns, offset_ns, pulse=unix_s is None))
-
-    def close(self) -> None:
-        with suppress(OSError):
-            self._socket.close()
-
-    def _send(self, sample: bytes) -> bool:
-        try:
-            self._socket.sendto(sample, self._path)
-        except OSError as error:
-            self.refused += 1
-            self.problem = f"{self.title} rejects samples: {error.strerror or error}; is it running with this socket?"
-            return False
-        self.sent += 1
-        self.problem = ""
-        return True

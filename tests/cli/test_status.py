@@ -37,7 +37,7 @@ def test_each_part_of_a_device_has_its_row_and_long_names_fit_80_columns_and_kee
         "  pps       60 edges, 0 lost",
         "  sin       400 triggers, 8 missed; 30.0 µs after the deadline, maximum 900.0 µs",
         "  utc       gpsd at 127.0.0.1:2947: 100 sentences, 90 sent, not sent: stale 7,",
-        "            busy 3; 59 pulses, 1 ignored; chronyd accepted 40, refused 19",
+        "            busy 3; 59 pulses, 1 ignored; sent to chronyd 40, refused 19",
         "            (chronyd does not take samples)",
     ]  # fmt: skip
     port = "/dev/serial/by-id/usb-Silicon_Labs_CP2102N_USB_to_UART_Bridge_Controller_7cb5c9f6a1e4e811-if00-port0"

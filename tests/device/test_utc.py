@@ -18,7 +18,7 @@ from imud.links.memory import MemoryOptions
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.sampling.clock import SampleClock
-from imud.utc.pps import ChronyFeed
+from imud.utc.chrony import ChronyFeed
 from imud.utc.receivers import RmcOptions
 from imud.utc.rmc_feed import RmcFeed
 from imud.utc.system_clock import KernelClock

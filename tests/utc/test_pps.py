@@ -1,23 +1,13 @@
 """UTC from pulses and sentences, compared with the truth."""
 
-import os
-import shutil
-import socket
-import subprocess
-import time
-from collections.abc import Iterator
-from contextlib import suppress
-from pathlib import Path
 from random import Random
 
 import pytest
 
 from imud.contracts.lines import UtcReference
 from imud.formats.nmea0183 import build
-from imud.host.clock import HostClock
 from imud.model.units import NS_PER_MS, NS_PER_S
-from imud.utc.pps import ChronyFeed, PpsReference, encode
-from tests.support.daemon_process import LIMIT_S
+from imud.utc.pps import PpsReference
 
 UTC_S = 1_795_000_000
 BEGIN_NS = 77 * NS_PER_S + 123_456_789
@@ -189,129 +179,3 @@ def test_the_fit_uses_the_last_16_pulses_and_their_spread() -> None:
     found = receiver.reference.reference(receiver.t_ns(16))
     assert found is not None
     assert found.error_ns == pytest.approx((5_000**2 + (1.4826 * 5_000) ** 2 + 5_000**2) ** 0.5, rel=0.15)
-
-
-@pytest.fixture
-def receiver(tmp_path: Path) -> Iterator[socket.socket]:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
-        sock.bind(str(tmp_path / "sock"))
-        sock.setblocking(False)
-        yield sock
-
-
-def feed(receiver: socket.socket, ahead_ns: int = 0) -> ChronyFeed:
-    """A feed on a host whose clock is `ahead_ns` ahead of UTC, and whose CLOCK_MONOTONIC is UTC - UTC_S."""
-    return ChronyFeed(receiver.getsockname(), lambda: UTC_S * NS_PER_S + ahead_ns)
-
-
-def test_the_layout_byte_by_byte() -> None:
-    sample = encode(1_500_000_000 * NS_PER_S + 123_456_789, -250_000_000, pulse=False, leap=2)
-    assert sample[:8] == (1_500_000_000).to_bytes(8, "little")
-    assert sample[8:16] == (123_456).to_bytes(8, "little")
-    assert sample[16:24] == bytes.fromhex("000000000000d0bf")  # -0.25
-    assert sample[24:36] == bytes([0, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0])
-    assert sample[36:] == b"KCOS"  # 0x534f434b
-    assert encode(0, 0, pulse=True)[24] == 1
-
-
-@pytest.mark.parametrize("ahead_ns", [0, 300 * NS_PER_MS, -7 * NS_PER_S - 1])
-def test_a_pulse_of_a_known_second_gives_the_whole_offset(receiver: socket.socket, ahead_ns: int) -> None:
-    chrony = feed(receiver, ahead_ns)
-    assert chrony.send_pulse(10 * NS_PER_S, UTC_S + 10)
-    assert receiver.recv(100) == encode((UTC_S + 10) * NS_PER_S + ahead_ns, -ahead_ns, pulse=False)
-    assert (chrony.sent, chrony.refused, chrony.problem) == (1, 0, "")
-    chrony.close()
-    chrony.close()
-
-
-@pytest.mark.parametrize(
-    ("ahead_ns", "given_ns"), [(0, 0), (300, -300), (-400, 400), (600, 400), (-600, -400), (3200, -200)]
-)
-def test_a_pulse_alone_gives_the_nearest_second(receiver: socket.socket, ahead_ns: int, given_ns: int) -> None:
-    chrony = feed(receiver, ahead_ns * NS_PER_MS)
-    chrony.send_pulse(10 * NS_PER_S)
-    expected = encode((UTC_S + 10) * NS_PER_S + ahead_ns * NS_PER_MS, given_ns * NS_PER_MS, pulse=True)
-    assert receiver.recv(100) == expected
-    chrony.close()
-
-
-def test_a_missing_socket_is_counted_and_the_next_sample_tried(tmp_path: Path) -> None:
-    chrony = ChronyFeed(str(tmp_path / "sock"), HostClock().utc_offset_ns)
-    assert not chrony.send_pulse(time.monotonic_ns())
-    assert chrony.refused == 1
-    assert "is it running" in chrony.problem
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
-        sock.bind(str(tmp_path / "sock"))
-        assert chrony.send_pulse(time.monotonic_ns())
-        assert chrony.problem == ""
-    assert not chrony.send_pulse(time.monotonic_ns())
-    assert (chrony.sent, chrony.refused) == (1, 2)
-    chrony.close()
-
-
-def test_a_receiver_that_does_not_read_blocks_nothing(receiver: socket.socket) -> None:
-    chrony = feed(receiver)
-    while not chrony.refused:
-        chrony.send_pulse(0)
-    assert chrony.sent > 0
-    chrony.close()
-    assert not chrony.send_pulse(0), "a closed feed refuses"
-    assert chrony.refused == 2
-
-
-# --- a real chronyd ---------------------------------------------------------------------------------------------------
-
-MISSING = next((name for name in ("chronyd", "chronyc") if not shutil.which(name)), "")
-NO_CHRONY = f"{MISSING} is not installed (Debian package chrony)" if MISSING else ""
-if not NO_CHRONY and os.geteuid() != 0:
-    NO_CHRONY = "chronyd needs root"
-
-
-@pytest.fixture
-def chronyd(tmp_path: Path) -> Iterator[Path]:
-    config = tmp_path / "chrony.conf"
-    config.write_text(
-        f"refclock SOCK {tmp_path}/imud.sock refid IMUD poll 0 filter 1\n"
-        f"bindcmdaddress {tmp_path}/command.sock\ncmdport 0\nport 0\npidfile {tmp_path}/pid\nuser root\n"
-    )
-    tmp_path.chmod(0o750)  # chronyd requires a folder without write permission for others
-    process = subprocess.Popen(["chronyd", "-x", "-d", "-f", str(config)], stderr=subprocess.PIPE, text=True)
-    try:
-        yield tmp_path
-    finally:
-        process.terminate()
-        _, said = process.communicate(timeout=LIMIT_S)
-        print(said)
-
-
-def sources(folder: Path) -> dict[str, list[str]]:
-    """Return the reference clocks of chronyd by name: the fields of `chronyc -c sources`."""
-    with suppress(subprocess.TimeoutExpired):
-        run = subprocess.run(
-            ["chronyc", "-h", str(folder / "command.sock"), "-c", "sources"],
-            capture_output=True, text=True, check=False, timeout=LIMIT_S,
-        )  # fmt: skip
-        return {fields[2]: fields for line in run.stdout.splitlines() if len(fields := line.split(",")) > 7}
-    return {}
-
-
-@pytest.mark.live
-@pytest.mark.skipif(bool(NO_CHRONY), reason=NO_CHRONY)
-def test_chronyd_takes_the_samples_and_sees_the_offset(chronyd: Path) -> None:
-    offset_ns = 123 * NS_PER_MS  # UTC according to the pulses minus the system clock
-    utc_offset_ns = HostClock().utc_offset_ns
-    chrony = ChronyFeed(str(chronyd / "imud.sock"), utc_offset_ns)
-    limit_s = time.monotonic() + LIMIT_S
-    while True:
-        now_ns = time.monotonic_ns()
-        utc_ns = now_ns + utc_offset_ns() + offset_ns
-        chrony.send_pulse(now_ns - utc_ns % NS_PER_S, utc_ns // NS_PER_S)
-        source = sources(chronyd).get("IMUD")
-        if source and source[5] != "0" and float(source[7]):
-            break
-        assert time.monotonic() < limit_s, (source, chrony.problem)
-        time.sleep(0.2)
-    assert source[0] == "#"  # a reference clock
-    # fields 7 and 8: adjusted and measured offset of the last sample; positive: the system clock is ahead
-    assert abs(float(source[8])) == pytest.approx(0.123, abs=0.02)
-    chrony.close()
