@@ -147,7 +147,7 @@ class SignalKServer:
     def status(self) -> OutputStatus:
         """Return the counters and the problem of the connection."""
         readers = int(self.is_open and self._is_storing)
-        problem = self._problem or self._client.problem
+        problem = "; ".join(filter(None, (self._problem, self._client.problem)))
         return OutputStatus(self._url, self._sent, self._dropped, readers, problem, self._client.refused)
 
     def close(self) -> None:
