@@ -18,9 +18,11 @@ from imud.host.peer_stream import PeerStream
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.model.work_budget import WorkBudget
 from imud.publishers.signalk import client as signalk_client
+from imud.publishers.signalk.client import REPLY_BYTES_MAX
+from imud.publishers.signalk.http_reply import HEAD_END, SWITCHING_PROTOCOLS, InvalidReply, ReplyParser
 from imud.publishers.signalk.server import DENIED, QUEUE_MAX, SignalKServer
 from imud.publishers.signalk.settings import SignalKOptions
-from imud.publishers.signalk.websocket import accept_of
+from imud.publishers.signalk.websocket import CONTROL_BYTES_MAX, InvalidFrame, WebSocketReader, accept_of
 from imud.testing.invariants import cut
 from imud.utc import receivers
 from imud.utc.receivers import GpsdSource, RmcOptions, SourceContext
@@ -42,13 +44,16 @@ SOURCE: Final = "imud.bow"
 
 
 def names() -> Sequence[str]:
-    return ["gpsd", "signalk"]
+    return ["gpsd", "signalk", "http-reply", "websocket"]
 
 
 def make(name: str) -> Target:
     if name == "gpsd":
         return Target(run_gpsd, stream_seeds_of_gpsd, mend, words=words, bytes_max=GPSD_BYTES_MAX)
-    return Target(run_signalk, signalk_seeds, words=signalk_words, bytes_max=SIGNALK_BYTES_MAX)
+    if name == "signalk":
+        return Target(run_signalk, signalk_seeds, words=signalk_words, bytes_max=SIGNALK_BYTES_MAX)
+    run = run_http_reply if name == "http-reply" else run_websocket
+    return Target(run, reply_seeds, words=signalk_words, bytes_max=SIGNALK_BYTES_MAX)
 
 
 class Network:
@@ -201,6 +206,48 @@ def run_signalk(data: bytes) -> None:
         network.run(body())
 
 
+def run_http_reply(data: bytes) -> None:
+    """The result does not depend on the pieces. A reply is at most as long as its limit."""
+    assert _parse_reply([data]) == _parse_reply(cut(data, Random(zlib.crc32(data))))
+
+
+def _parse_reply(pieces: Sequence[bytes]) -> tuple[object, ...]:
+    reply = ReplyParser(REPLY_BYTES_MAX)
+    rest = bytearray()
+    try:
+        for piece in pieces:
+            if reply.is_complete:
+                rest += piece
+            else:
+                reply.feed(piece)
+        if not reply.is_complete:
+            reply.end()
+    except InvalidReply as error:
+        check_printable(str(error))
+        return (str(error),)
+    assert 101 <= reply.status <= 999
+    is_switch = reply.status == SWITCHING_PROTOCOLS
+    return reply.status, reply.headers, bytes(reply.body), reply.rest + bytes(rest) if is_switch else b""
+
+
+def run_websocket(data: bytes) -> None:
+    """The control frames do not depend on the pieces. The reader stores at most one head or control frame."""
+    assert _read_frames([data]) == _read_frames(cut(data, Random(zlib.crc32(data))))
+
+
+def _read_frames(pieces: Sequence[bytes]) -> list[object]:
+    reader = WebSocketReader()
+    results: list[object] = []
+    try:
+        for piece in pieces:
+            results += reader.feed(piece)
+            assert len(reader._rest) < 2 + CONTROL_BYTES_MAX
+    except InvalidFrame as error:
+        check_printable(str(error))
+        return [str(error)]
+    return results
+
+
 def stream_seeds_of_gpsd() -> list[bytes]:
     utc_ns = VirtualClock().realtime_ns()
     seconds = [build(utc_ns + second * NS_PER_S) for second in range(20)]
@@ -235,6 +282,10 @@ def signalk_seeds() -> list[bytes]:
         [open_server, b"HTTP/1.1 200 OK\r\n\r\n"], [b"SSH-2.0\r\n\r\n"], [open_server, websocket + b"\x81\x00" * 300],
     ]  # fmt: skip
     return [NEXT.join(session) for session in sessions]
+
+
+def reply_seeds() -> list[bytes]:
+    return sorted({part for seed in signalk_seeds() for part in [*seed.split(NEXT), *seed.split(HEAD_END)]})
 
 
 def signalk_words() -> list[bytes]:
