@@ -14,6 +14,7 @@ from math import tau
 from typing import Final
 
 from imud.formats.j1939 import PGN_BYTES
+from imud.model.units import NS_PER_MS
 
 HEADING, RATE_OF_TURN, ATTITUDE = 127250, 127251, 127257
 PRIORITIES: Final = {HEADING: 2, RATE_OF_TURN: 2, ATTITUDE: 3}  # default priorities of the standard
@@ -44,7 +45,8 @@ def pack_heading(
 ) -> bytes:
     """Return 127250 of a clockwise heading, without deviation. `variation_rad`: positive to the east. None means "not
     available"."""
-    counts = NO_U16 if heading_rad is None else round(heading_rad % tau / RAD_PER_LSB)
+    # the modulus also after the rounding: 2π is 62,831.85 counts, and 62,832 counts are above a full turn
+    counts = NO_U16 if heading_rad is None else round(heading_rad % tau / RAD_PER_LSB) % HEADING_MOST
     return HEADING_LAYOUT.pack(sid, counts, NO_I16, _i16(variation_rad), 0xFC | reference)
 
 
@@ -108,9 +110,12 @@ def pack_nack(requester: int, pgn: int) -> bytes:
     return bytes((1, 0xFF, 0xFF, 0xFF, requester)) + pgn.to_bytes(PGN_BYTES, "little")
 
 
-def pack_heartbeat(every_ms: int, counter: int) -> bytes:
+HEARTBEAT_NS_PER_LSB: Final = 10 * NS_PER_MS  # resolution of the period in a heartbeat, ns
+
+
+def pack_heartbeat(period_ns: int, counter: int) -> bytes:
     """Return 126993: period, counter 0 … 252; controller error-active, no second controller, equipment operational."""
-    return struct.pack("<HBB", every_ms, counter, 0b1100_1100) + b"\xff" * 4
+    return struct.pack("<HBB", period_ns // HEARTBEAT_NS_PER_LSB, counter, 0b1100_1100) + b"\xff" * 4
 
 
 VERSION: Final = 2100  # version of the message definitions, 1/1000

@@ -12,6 +12,7 @@ from nmea2000 import NMEA2000Decoder
 from imud.formats import nmea2000
 from imud.formats.j1939 import J1939Id, join
 from imud.formats.nmea2000 import Reference
+from imud.model.units import NS_PER_S
 
 NAME = nmea2000.pack_name(0x12345, 3)
 
@@ -33,7 +34,9 @@ NAME = nmea2000.pack_name(0x12345, 3)
         # unique 0x12345, manufacturer 2046 << 21; instance 3, function 140, class 60 << 1; industry 4, arbitrary
         (NAME.to_bytes(8, "little"), "4523c1ff 03 8c 78 c0"),
         (nmea2000.pack_nack(9, 127508), "01 ffffff 09 14f201"),
-        (nmea2000.pack_heartbeat(60_000, 5), "60ea 05 cc ffffffff"),
+        (nmea2000.pack_heartbeat(60 * NS_PER_S, 5), "7017 05 cc ffffffff"),  # 60 s = 6000 counts of 0.01 s
+        # 359.9999° = 6.283184 rad = 62831.84 counts: 62832 counts would be above a full turn
+        (nmea2000.pack_heading(0, math.radians(359.9999), Reference.TRUE), "00 0000 ff7f ff7f fc"),
         (nmea2000.pack_configuration("bow", "", "ü"), "0501626f77 0201 03013f"),
         (nmea2000.pack_pgn_list(False, (127250, 127257)), "00 12f101 19f101"),
         (b"".join(nmea2000.fast_packet(9, bytes(range(8)))), "20 08 000102030405 21 0607 ffffffffff"),

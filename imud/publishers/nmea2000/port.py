@@ -21,7 +21,8 @@ from imud.formats.j1939 import CLAIMED, REQUEST, TRANSPORT_CONTROL, TRANSPORT_DA
 from imud.host import netlink
 from imud.model.errors import LinkError, reason_of
 from imud.model.units import NS_PER_MS, NS_PER_S
-from imud.publishers.nmea2000.node import Message, Node
+from imud.publishers.nmea2000.address import Message
+from imud.publishers.nmea2000.node import Node
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +35,7 @@ TURN_FRAMES: Final = 64  # maximum number of received frames in one turn of the 
 CHECK_NS: Final = NS_PER_S  # time between two checks of the interface, ns
 RETRY_FIRST_NS: Final = NS_PER_S  # pause before imud opens the interface again, ns; it doubles
 RETRY_MOST_NS: Final = 30 * NS_PER_S
+LOG_NS: Final = 60 * NS_PER_S  # minimum time between two log lines about other nodes of the bus, ns
 BUS_OFF: Final = 3  # state of the controller (`enum can_state` of linux/can/netlink.h)
 FULL: Final = (errno.ENOBUFS, errno.EAGAIN)
 # Received PGNs with any source and any destination. The node checks the destination.
@@ -87,7 +89,10 @@ class NodePort:
         self._full_ns: int | None = None  # time since which the kernel accepts no frame; None if it accepts frames
         self._due_ns = 0  # time of the next check of the interface, or of the next try to open it
         self._wait_ns = RETRY_FIRST_NS
-        self._sent = self._dropped = self._malformed = 0
+        self._sent = self._dropped = 0
+        self._log_ns = 0  # earliest time of the next log line about other nodes
+        self._logged_problem = ""  # last logged problem of the node
+        self._logged_malformed = 0  # last logged number of frames with an invalid length
         self._problem = "not open yet"
 
     def put(self, messages: Iterable[Message | None]) -> None:
@@ -112,15 +117,15 @@ class NodePort:
             )
         if self._socket is not None:
             self.put(self._node.tick(now_ns))
-        if self._node.malformed != self._malformed:
-            self._malformed = self._node.malformed
-            log.info("nmea2000: %s: ignored frames with an invalid length: %d", self._interface, self._malformed)
+        if now_ns >= self._log_ns:
+            self._log_nodes(now_ns)
 
     def status(self) -> OutputStatus:
-        problem = self._problem or self._node.problem
-        dropped = self._dropped + self._node.refused
-        name, is_open = f"can {self._interface}", int(not problem)
-        return OutputStatus(name, self._sent, dropped, is_open, problem, self._node.malformed)
+        node = self._node
+        problem = self._problem or node.problem or node.peer_problem(self._now_ns())
+        is_sending = not self._problem and node.claimed is not None
+        name = f"can {self._interface}"
+        return OutputStatus(name, self._sent, self._dropped + node.refused, int(is_sending), problem, node.ignored)
 
     def close(self) -> None:
         """Close the socket. A second call does nothing."""
@@ -148,6 +153,10 @@ class NodePort:
 
     def _read(self) -> None:
         """Read at most TURN_FRAMES frames. The event loop calls again for the rest."""
+        self._read_turn(self._now_ns())
+        self._node.end_turn()
+
+    def _read_turn(self, now_ns: int) -> None:
         for _ in range(TURN_FRAMES):
             opened = self._socket
             if opened is None:
@@ -163,7 +172,7 @@ class NodePort:
                 continue
             flagged_id, size, data = RAW_FRAME.unpack(frame)
             if flagged_id & ~EXTENDED_ID_MAX == EXTENDED_FLAG:
-                self.put(self._node.receive(flagged_id & EXTENDED_ID_MAX, data[:size], self._now_ns()))
+                self.put(self._node.receive(flagged_id & EXTENDED_ID_MAX, data[:size], now_ns))
 
     def _flush(self) -> None:
         """Send queued frames while the kernel accepts them."""
@@ -201,6 +210,22 @@ class NodePort:
         self._note(problem)
         self._due_ns = self._now_ns() + self._wait_ns
         self._wait_ns = min(2 * self._wait_ns, RETRY_MOST_NS)
+
+    def _log_nodes(self, now_ns: int) -> None:
+        """Log changes that other nodes cause. The caller limits the rate."""
+        node = self._node
+        problem = node.problem or node.peer_problem(now_ns)
+        if bool(problem) is not bool(self._logged_problem):
+            self._logged_problem = problem
+            self._log_ns = now_ns + LOG_NS
+            if problem:
+                log.warning("nmea2000: %s: %s", self._interface, problem)
+            else:
+                log.info("nmea2000: %s: no problem with other nodes", self._interface)
+        if node.malformed != self._logged_malformed:
+            self._logged_malformed = node.malformed
+            self._log_ns = now_ns + LOG_NS
+            log.info("nmea2000: %s: ignored frames with an invalid length: %d", self._interface, node.malformed)
 
     def _note(self, problem: str) -> None:
         if problem != self._problem:

@@ -32,7 +32,7 @@ from imud.model.ledger import Ledger
 from imud.model.sample import Measurement, Sample, Sync, Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.publishers.nmea2000 import Nmea2000Options, output, port
-from imud.publishers.nmea2000.node import NodeFrame
+from imud.publishers.nmea2000.address import NodeFrame
 from tests.support.event_loops import VirtualClock, in_loop
 from tests.support.publisher_context import FakeLatencies, publisher_context
 from tests.support.socket_rig import device_status
@@ -284,6 +284,50 @@ def test_the_unique_number_is_a_hash_of_the_host(tmp_path: Path) -> None:
     assert output.unique_number(file) == 1579412 != without
 
 
+@in_loop
+async def test_second_node_with_name_is_in_status(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Replays of the NAME for 60 s: the status names the cause, data continue, and the log has one line."""
+    rig = Rig(monkeypatch)
+    rig.tick(1)
+    rig.tick(500)
+    can_id, name = rig.received()[0]  # the claim
+    caplog.clear()
+    for _ in range(120):
+        rig.tick(500)
+        for source in (128, 129, 130, 131):
+            rig.far.send(pack_frame(can_id & ~0xFF | source, True, name))
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+    status = rig.output.status()[0]
+    assert status.problem.startswith("another node has the NAME")
+    assert (status.readers, status.discarded) == (1, 480)
+    assert len(caplog.records) <= 2
+    rig.tick(500)
+    rig.received()
+    rig.publish()
+    assert 127250 in {split(can_id).pgn for can_id, _ in rig.received()}
+    rig.close()
+
+
+@in_loop
+async def test_node_with_many_requests_is_in_status(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig(monkeypatch).settle()
+    request_id = join(J1939Id(6, 59904, 7, 128))
+    for _ in range(50):
+        rig.far.send(pack_frame(request_id, True, (126996).to_bytes(3, "little")))
+    for _ in range(3):
+        await asyncio.sleep(0)
+    status = rig.output.status()[0]
+    assert status.problem.startswith("the node with address 7 sends more than imud processes: 18 inputs")
+    assert (status.readers, status.discarded) == (1, 18)
+    assert len(rig.received()) == 20  # one reply of 20 frames
+    rig.tick(11_000)
+    assert rig.output.status()[0].problem == ""
+    rig.close()
+
+
 HOSTILE = st.tuples(st.integers(0, 0xFFFF_FFFF), st.binary(max_size=8))
 
 
@@ -313,9 +357,11 @@ def test_hostile_frames_never_end_the_output(frames: list[tuple[int, bytes]]) ->
 
 @in_loop
 async def test_messages_of_an_unopened_port_are_dropped() -> None:
-    one = port.NodePort(Mock(refused=1, problem=""), "can0", lambda: 0)
-    one.put([None, [NodeFrame(1, b"")]])
-    assert (one.status().dropped, one.status().problem) == (3, "not open yet")
+    node = Mock(refused=1, problem="", ignored=0, claimed=None)
+    node.peer_problem.return_value = ""
+    node_port = port.NodePort(node, "can0", lambda: 0)
+    node_port.put([None, [NodeFrame(1, b"")]])
+    assert (node_port.status().dropped, node_port.status().problem) == (3, "not open yet")
 
 
 def test_an_output_that_is_off_imports_only_its_options() -> None:
