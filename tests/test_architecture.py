@@ -146,6 +146,7 @@ LONG_MODULES = {
     "imud.cli.top": "the display of one command: table, details of a device, keys",
     "imud.device.settings": "one state machine: identity and settings of a device, with its comparison",
     "imud.drivers.imu61x.uart.settings": "the table of settings with its scripts",
+    "imud.links.socketcan": "one link: options, bus state, socket, and frames with their times",
     "imud.publishers.metrics.families": "one table: the metric families",
     "imud.publishers.recorder.flight": "one state machine: the flight recorder",
     "imud.publishers.shm": "one output: rings and their directory",

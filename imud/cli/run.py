@@ -14,6 +14,7 @@ from imud.cli.output import complain
 from imud.config.model import Config, DeviceConfig
 from imud.config.yaml import FILE_BYTES_MAX
 from imud.contracts.lines import DeviceLines
+from imud.contracts.link import HostProblem
 from imud.contracts.setting import declared_values
 from imud.daemon import Daemon
 from imud.drivers import DRIVERS
@@ -21,8 +22,10 @@ from imud.fleet.settings import EVERY
 from imud.host import event_loop
 from imud.host.log import STDERR, is_journal, log_to
 from imud.host.process_end import STOP_LIMIT_S, EndDeadline
+from imud.links import LINKS
 from imud.model.errors import ConfigError, ImudError, ServerError
 from imud.model.options import unknown_name
+from imud.publishers import PUBLISHERS
 from imud.publishers.rules.settings import RulesOptions
 from imud.publishers.shm import ShmOptions, directory_problem
 
@@ -86,6 +89,9 @@ def check(args: argparse.Namespace) -> int:
     """Print one line if the file is valid, and notes. Return 1 if a driver or output of another package has a problem,
     otherwise 0. Raises ConfigError with line and column if the file is invalid."""
     settings = config.parse(standard_input(), "standard input") if args.file == "-" else config.load(args.file)
+    problems = list(unfit_values(settings))
+    if errors := [f"{args.file}: {place}: {problem.message}" for place, problem in problems if problem.is_error]:
+        raise ConfigError("\n".join(errors))
     names = ", ".join(device.name for device in settings.devices) or "none"
     print(f"{args.file}: valid; devices: {names}")
     for device in settings.devices:
@@ -93,9 +99,22 @@ def check(args: argparse.Namespace) -> int:
             print(f"{args.file}:{device.line}: note: {device.name}: {note}")
     for note in (*unknown_devices(settings), *rules_without_values(settings), *missing_directories(settings)):
         print(f"{args.file}: note: {note}")
+    for place, host_problem in problems:
+        print(f"{args.file}: note: {place}: {host_problem.message}")
     for problem in settings.ignored:
         complain(problem)
     return 1 if settings.ignored else 0
+
+
+def unfit_values(settings: Config) -> Iterator[tuple[str, HostProblem]]:
+    """Yield the key and the problem of each value that does not fit this host."""
+    for device in settings.devices:
+        for problem in LINKS[device.link].host_problems(device.link_settings):
+            yield f"devices.{device.name}.{device.link}.{problem.key}", problem
+    for name, options in settings.publishers.items():
+        if name in PUBLISHERS and PUBLISHERS[name].wanted(options):
+            for problem in PUBLISHERS[name].host_problems(options):
+                yield f"{name}.{problem.key}", problem
 
 
 def unknown_devices(settings: Config) -> Iterator[str]:

@@ -2,7 +2,7 @@
 end.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final, Generic, NamedTuple, Protocol, TypeVar
@@ -36,6 +36,14 @@ class Conflict(NamedTuple):
 
     key: str  # key of the option that the user must change
     message: str  # expected value, received value, and the owner of the claim
+
+
+class HostProblem(NamedTuple):
+    """Value of an option that does not fit this host. `imud check` prints it."""
+
+    key: str  # key of the option
+    message: str  # expected value, received value, and the next step
+    is_error: bool  # whether the value is wrong as long as the named object exists; False for an absent object
 
 
 def conflict_of(mine: Claim, other: Claim, owner: str) -> Conflict | None:
@@ -271,6 +279,10 @@ def _claims_nothing(_settings: Options) -> Sequence[Claim]:
     return ()
 
 
+def _fits_host(_settings: Options) -> Iterable[HostProblem]:
+    return ()
+
+
 def _knows_no_problem(_settings: Options, _frames: bool) -> str:
     return ""
 
@@ -292,6 +304,8 @@ class LinkType(Generic[S]):
     """Returns why `open` would reject these options; empty if no reason is known. It does not open the port.
 
     The second argument is True if the link must deliver CAN frames."""
+    # Returns the values of these options that do not fit this host. It opens nothing.
+    host_problems: Callable[[S], Iterable[HostProblem]] = _fits_host
 
     @property
     def polled(self) -> bool:

@@ -13,7 +13,7 @@ from imud.contracts.command import CalibrationResult, Calibrations, LastCalibrat
 from imud.contracts.driver import Driver
 from imud.contracts.firmware import FirmwareControl
 from imud.contracts.lines import DriveLine, LineOptions, UtcReference, WatchLine
-from imud.contracts.link import Claim
+from imud.contracts.link import Claim, HostProblem
 from imud.contracts.registry import load
 from imud.contracts.setting import AppliedSettings, SettingsPlan, SettingsReport
 from imud.contracts.status import (
@@ -402,4 +402,6 @@ class PublisherType:
     required: bool = False
     # Finds keys that contradict the drivers. Returns a reason, one sentence, by the path of the key.
     check: Callable[[Any, Mapping[str, Driver]], Mapping[tuple[str, ...], str]] = lambda _options, _drivers: {}
+    # Returns the values of these options that do not fit this host. It opens nothing.
+    host_problems: Callable[[Any], Iterable[HostProblem]] = lambda _options: ()
     interface: int = 0  # interface version for which another package was written; 0 for outputs of imud

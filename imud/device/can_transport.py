@@ -118,6 +118,7 @@ class CanTransport(ReceivingTransport):
         self._conflict = ""  # present conflict of two devices with one address; empty without a conflict
         # error of the driver of another package at the start; `wait_present` raises it in the task of the device
         self._start_failure: DriverFailed | None = None
+        self._damaged = 0  # counted number of frames that the adapter damaged since the link was opened
         if not self._searchable:
             driver = DRIVERS[self._config.driver]
             if not isinstance(driver, CanDriver):
@@ -142,6 +143,7 @@ class CanTransport(ReceivingTransport):
 
     def start(self, on_end: OnEnd) -> None:
         self._bus_problem = self._conflict = ""
+        self._damaged = 0
         self._search.start()
         self.link.start(self._on_frames, self._on_news, on_end)
 
@@ -356,7 +358,19 @@ class CanTransport(ReceivingTransport):
     def tick(self, now_ns: int) -> None:
         if self._is_wide and self._round is None and self._health.state is DeviceState.RUNNING:
             self._set_filters(wide=False)
+        if self.path is not None and self._round is None:
+            self._count_damaged(self.path)
         self._report_conflict()
+
+    def _count_damaged(self, path: CanPath) -> None:
+        """Count frames that arrived damaged from the adapter. Their sender is unknown: a sample may be lost."""
+        framing = self.link.kernel_counters().framing
+        count = framing - self._damaged
+        self._damaged = framing
+        for _ in range(count):
+            self._context.ledger.add_unknown_gap()
+        if count and path.observer is not None:
+            path.observer.call("ledger", "set", self._context.ledger.snapshot())
 
     def _report_conflict(self) -> None:
         """Report the start and the end of a conflict of two devices with one address."""

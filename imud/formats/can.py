@@ -37,6 +37,20 @@ bits.
 """
 
 
+INTERFACE_BYTES_MAX: Final = 15  # maximum length of the name of a network interface (IFNAMSIZ - 1)
+
+
+def interface_problem(name: str) -> str:
+    """Return why the kernel refuses this name of an interface; empty if it accepts the name."""
+    is_valid = len(name.encode()) <= INTERFACE_BYTES_MAX and name not in (".", "..")
+    if is_valid and not any(character in "/:" or character.isspace() for character in name):
+        return ""
+    return (
+        f"expected the name of a network interface, at most {INTERFACE_BYTES_MAX} bytes without `/`, `:` and spaces, "
+        f"got {name}; `ip link` lists the interfaces"
+    )
+
+
 class CanFrame(NamedTuple):
     """Received data frame."""
 

@@ -49,6 +49,17 @@ def absence(name: str, sys: Path = SYS) -> str:
     return "" if flags & IFF_UP else f"{name} is down: set its bit rate and bring it up (`ip link set {name} up`)"
 
 
+def misfit(name: str, sys: Path = SYS) -> tuple[str, bool] | None:
+    """Return the reason why this host has no such CAN interface, and whether another kind of interface has this name;
+    None if the interface exists."""
+    try:
+        is_absent = not (sys / "class/net" / name).exists()
+        reason = absence(name, sys)
+    except LinkError as error:
+        return f"expected a CAN interface, got {name}: {error}", True
+    return (reason, False) if is_absent else None
+
+
 def can_interfaces(sys: Path = SYS, *, down: bool = False) -> list[str]:
     """Return the names of the CAN interfaces that are up, sorted. With `down`, include the interfaces that are down."""
     found = []

@@ -20,6 +20,7 @@ from typing import Any, Final, NamedTuple
 from imud.contracts.lines import Edge, InputOptions, LineFactory, LineOptions, OnEdges, OnLineEnd, OutputOptions
 from imud.host.files import group_of, user_name
 from imud.host.installation import install_command
+from imud.host.library_call import LibraryCall
 from imud.model.errors import LinkBusy, LinkDenied, LinkError, LinkMissing
 
 DEVICES: Final = Path("/dev")
@@ -43,7 +44,8 @@ class LineLocation(NamedTuple):
 def load_gpiod() -> Any:
     """Import gpiod. Raises LinkError if it is not installed, or if it is the module of libgpiod 1."""
     try:
-        import gpiod
+        with LibraryCall("import gpiod", ImportError):
+            import gpiod
     except ImportError as error:
         raise LinkError(
             f"GPIO lines need the Python package gpiod, got none; run `{install_command(GPIOD)}`"
@@ -95,7 +97,8 @@ def request_error(gpiod: Any, error: OSError, location: LineLocation) -> LinkErr
     """Return the LinkError for a line request that the kernel refused."""
     if error.errno == errno.EBUSY:
         holder = ""
-        with suppress(OSError), gpiod.Chip(location.path) as chip:  # the chip may be removed by now
+        # the chip may be removed by now
+        with suppress(OSError, LinkError), LibraryCall("read", OSError), gpiod.Chip(location.path) as chip:
             holder = chip.get_line_info(location.offset).consumer or ""
         return LinkBusy(f"{location} is in use by {holder or 'an unknown program'}: stop it, or choose another line")
     if error.errno in (errno.ENODEV, errno.ENOENT, errno.EACCES, errno.EPERM):
@@ -146,7 +149,7 @@ def _nodes(devices: Path) -> list[str]:
 
 def _read(gpiod: Any, path: str) -> _Chip:
     try:
-        with gpiod.Chip(path) as chip:
+        with LibraryCall(f"use {path} as a GPIO chip", OSError), gpiod.Chip(path) as chip:
             info = chip.get_info()
             return _Chip(path, info.label, tuple(chip.get_line_info(n).name or "" for n in range(info.num_lines)))
     except OSError as error:
@@ -233,9 +236,10 @@ class _Line:
         location = find_line(gpiod, self._settings, self._devices)
         consumer = f"imud {self._purpose}".strip()[:CONSUMER_CHARACTERS]
         try:
-            self._request = gpiod.request_lines(
-                location.path, {location.offset: config(gpiod)}, consumer, event_buffer_size=events
-            )
+            with LibraryCall(f"request {location}", OSError):
+                self._request = gpiod.request_lines(
+                    location.path, {location.offset: config(gpiod)}, consumer, event_buffer_size=events
+                )
         except OSError as error:
             raise request_error(gpiod, error, location) from error
         self._location, self._fd = location, self._request.fd
@@ -244,7 +248,8 @@ class _Line:
     def _release(self) -> None:
         request, self._request, self._fd = self._request, None, -1
         if request is not None:
-            request.release()
+            with suppress(OSError, LinkError), LibraryCall(f"release {self.title}", OSError):  # the chip was removed
+                request.release()
 
     def _error(self, error: OSError) -> LinkError:
         if error.errno in GONE:
@@ -309,7 +314,8 @@ class GpioInput(_Line):
         if self._request is None:
             raise LinkError(f"{self.title} is not open")
         try:
-            return bool(self._request.get_value(self._location.offset))
+            with LibraryCall(f"read {self.title}", OSError):
+                return bool(self._request.get_value(self._location.offset))
         except OSError as error:
             raise self._error(error) from error
 

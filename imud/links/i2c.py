@@ -7,6 +7,7 @@ time.
 
 import fcntl
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Annotated, Final, Literal, Protocol
 
 from msgspec import Meta
@@ -15,6 +16,7 @@ from smbus2 import I2cFunc, SMBus, i2c_msg
 from imud.contracts.link import Claim, LinkType
 from imud.contracts.script import Transfer
 from imud.contracts.status import KernelCounters
+from imud.host.library_call import LibraryCall
 from imud.links.device_node import DeviceNode, bus_open_problem, transfer_problem
 from imud.model.errors import LinkError
 from imud.model.options import Options
@@ -78,6 +80,7 @@ class I2cLink:
         self._address = 0
         self._place = ""
         self.title = bus_of(settings)
+        self._library = LibraryCall(f"use {self.title}", OSError)
         self.writable = True
         self.bus = self.title
         self.target: int | None = None if settings.address == "auto" else settings.address
@@ -110,9 +113,10 @@ class I2cLink:
         if bus is None:
             raise LinkError(f"{self.title} is not open")
         try:
-            if bus.funcs & I2cFunc.I2C:
-                return self._combined(bus, sent, transfer.read_bytes)
-            return self._block(bus, sent, transfer.read_bytes)
+            with self._library:
+                if bus.funcs & I2cFunc.I2C:
+                    return self._combined(bus, sent, transfer.read_bytes)
+                return self._block(bus, sent, transfer.read_bytes)
         except OSError as error:
             raise transfer_problem(error, self.title, self._place) from error
 
@@ -130,12 +134,17 @@ class I2cLink:
     def close(self) -> None:
         bus, self._bus = self._bus, None
         if bus is not None:
-            bus.close()
+            with suppress(OSError, LinkError), self._library:  # the adapter was removed
+                bus.close()
 
     def _open(self) -> None:
         try:
-            self._bus = self._open_bus(self.title)
-            self._ioctl(self._bus.fd or 0, I2C_TIMEOUT, TIMEOUT_10MS)
+            with self._library:
+                self._bus = self._open_bus(self.title)
+                self._ioctl(self._bus.fd or 0, I2C_TIMEOUT, TIMEOUT_10MS)
+        except LinkError:
+            self.close()
+            raise
         except OSError as error:
             self.close()
             raise bus_open_problem(error, self.title, SWITCHED_ON) from error

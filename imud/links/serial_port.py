@@ -23,6 +23,7 @@ from typing import Final
 import serial
 
 from imud.contracts.status import KernelCounters
+from imud.host.library_call import LibraryCall
 from imud.links.device_node import CABLE, PROC, errno_of, open_problem
 from imud.model.errors import LinkBusy, LinkError, reason_of
 from imud.model.units import NS_PER_MS
@@ -44,6 +45,8 @@ ICOUNTER_INTS: Final = 20
 FRAME, OVERRUN, PARITY, BREAK, BUFFER_OVERRUN = 6, 7, 8, 9, 10
 
 
+# Exceptions of a port that imud explains. All other exceptions of pyserial become a LinkError too.
+EXPECTED: Final = (OSError, ValueError, termios.error)
 # Attributes of pyserial for its two pipes, with which another thread can end a wait in `read` or `write`.
 PIPE_ENDS: Final = ("pipe_abort_read_r", "pipe_abort_read_w", "pipe_abort_write_r", "pipe_abort_write_w")
 
@@ -63,26 +66,29 @@ class DescriptorPort(serial.Serial):
     def close(self) -> None:
         """Release the exclusive mode and close the port. The kernel keeps this mode while another program has the port
         open, and a pseudo-terminal keeps it until its program ends."""
-        if self.is_open:
-            descriptor = self.fileno()
+        descriptor = self.fd
+        if descriptor is not None:
             self.fd, self.is_open = None, False
             with contextlib.suppress(OSError):  # the port was removed
                 fcntl.ioctl(descriptor, termios.TIOCNXCL)
-            os.close(descriptor)
+            with contextlib.suppress(OSError):  # the kernel closes the descriptor also after an error
+                os.close(descriptor)
 
 
 def open_port(path: str, baud: int, proc: Path) -> serial.Serial:
     """Open `path` exclusively, raw 8N1, no flow control. Raises LinkMissing, LinkDenied, LinkBusy or LinkError."""
     try:
         # inter_byte_timeout=0 sets VMIN=1: a read without data then gives EAGAIN, and 0 bytes always mean a hang-up
-        port = DescriptorPort(path, baud, exclusive=True, timeout=0, write_timeout=0, inter_byte_timeout=0)
-    except (OSError, ValueError, termios.error) as error:
+        with LibraryCall(f"open {path}", *EXPECTED):
+            port = DescriptorPort(path, baud, exclusive=True, timeout=0, write_timeout=0, inter_byte_timeout=0)
+    except EXPECTED as error:
         raise port_problem(error, path, proc) from error
     try:
-        fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
-        _finish_raw(port.fileno())
-        _check_rate(port, path, baud)
-    except (OSError, termios.error) as error:
+        with LibraryCall(f"open {path}", *EXPECTED):
+            fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
+            _finish_raw(port.fileno())
+            _check_rate(port, path, baud)
+    except EXPECTED as error:
         port.close()
         raise port_problem(error, path, proc) from error
     except LinkError:
@@ -94,10 +100,11 @@ def open_port(path: str, baud: int, proc: Path) -> serial.Serial:
 def change_baud(port: serial.Serial, path: str, baud: int, proc: Path) -> None:
     """Set another rate and discard the bytes of the old rate. Raises LinkError for an unsupported rate."""
     try:
-        port.baudrate = baud
-        termios.tcflush(port.fileno(), termios.TCIFLUSH)
-        _check_rate(port, path, baud)
-    except (OSError, ValueError, termios.error) as error:
+        with LibraryCall(f"set {baud} baud on {path}", *EXPECTED):
+            port.baudrate = baud
+            termios.tcflush(port.fileno(), termios.TCIFLUSH)
+            _check_rate(port, path, baud)
+    except EXPECTED as error:
         raise port_problem(error, path, proc) from error
 
 
@@ -137,7 +144,8 @@ def _check_rate(port: serial.Serial, path: str, baud: int) -> None:
 
 def request_low_latency(port: serial.Serial, path: str, sys: Path) -> None:
     """Request low latency from driver and adapter. Many drivers and ptys do not support it."""
-    with contextlib.suppress(ValueError):  # ValueError of pyserial: the driver has no TIOCSSERIAL
+    # ValueError of pyserial: the driver has no TIOCSSERIAL. LinkError: any other exception of pyserial
+    with contextlib.suppress(ValueError, LinkError), LibraryCall(f"request low latency of {path}", ValueError):
         port.set_low_latency_mode(True)
     timer_ms = read_latency_timer_ms(path, sys)
     if timer_ms is not None and timer_ms > 1:

@@ -13,7 +13,7 @@ import os
 import socket
 import struct
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from enum import IntEnum
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,7 @@ from typing import Annotated, Any, Final
 
 from msgspec import Meta
 
-from imud.contracts.link import CanLink, Claim, LinkType, OnBusNews, OnEnd, OnFrames
+from imud.contracts.link import CanLink, Claim, HostProblem, LinkType, OnBusNews, OnEnd, OnFrames
 from imud.contracts.status import KernelCounters
 from imud.formats import kernel
 from imud.formats.can import (
@@ -35,10 +35,12 @@ from imud.formats.can import (
     CanFilter,
     CanFrame,
     CyclicFrame,
+    interface_problem,
     pack_filters,
 )
 from imud.host import netlink
 from imud.host.files import user_name
+from imud.links.can_backends import backend_problem, check_backend
 from imud.links.cyclic_sender import NO_MANAGER, KernelSender, LoopSender, Sender
 from imud.model.errors import LinkDenied, LinkError, LinkMissing
 from imud.model.options import Options
@@ -346,7 +348,11 @@ class SocketCanOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields
     """Bit rate of the data phase of CAN FD that imud sets for another backend, bit/s; 0: classical CAN."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError for keys that exclude each other."""
+        """Raises ValueError for an unknown backend, an invalid interface, and keys that exclude each other."""
+        if self.backend != NATIVE:
+            check_backend(self.backend)
+        elif reason := interface_problem(self.interface):
+            raise ValueError(f"interface: {reason}")
         for key in ("bitrate", "data_bitrate"):
             if getattr(self, key) and self.backend == NATIVE:
                 raise ValueError(f"{key}: expected no value with backend socketcan; the system sets it (docs/can.md)")
@@ -584,6 +590,16 @@ def make(settings: SocketCanOptions) -> CanLink:
     return PythonCanLink(settings.backend, settings.interface, settings.bitrate, settings.data_bitrate)
 
 
+def _host_problems(settings: SocketCanOptions) -> Iterator[HostProblem]:
+    """Yield the reason why this host has no such interface, or lacks the library of the backend."""
+    if settings.backend == NATIVE:
+        # no note about an absent interface: adapters often appear later, and the device reports its state
+        if (misfit := netlink.misfit(settings.interface)) and misfit[1]:
+            yield HostProblem("interface", *misfit)
+    elif problem := backend_problem(settings.backend):
+        yield HostProblem("backend", *problem)
+
+
 def _claims(settings: SocketCanOptions) -> list[Claim]:
     """Return the claim of a device: a shared bus, or the port of a serial adapter (`slcan`) for one device."""
     name, port = settings.interface, settings.interface.startswith("/")
@@ -592,4 +608,4 @@ def _claims(settings: SocketCanOptions) -> list[Claim]:
     return [Claim(place=place, key="interface", shared=not port, terms=rates)]
 
 
-LINK = LinkType("socketcan", SocketCanOptions, make_can=make, claims=_claims)
+LINK = LinkType("socketcan", SocketCanOptions, make_can=make, claims=_claims, host_problems=_host_problems)

@@ -13,6 +13,7 @@ import os
 import struct
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Annotated, Final, Literal
 
 from msgspec import Meta
@@ -135,7 +136,8 @@ class SpiLink:
         fd, self._fd = self._fd, -1
         self._prepared.clear()
         if fd >= 0:
-            self._close_node(fd)
+            with suppress(OSError):  # the kernel closes the descriptor also after an error
+                self._close_node(fd)
 
     def _open(self) -> None:
         try:

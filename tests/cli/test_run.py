@@ -11,6 +11,7 @@ import pytest
 
 from imud import config
 from imud.cli.run import state_dir
+from imud.links import can_backends
 from imud.model.errors import ImudError, ServerError
 from tests.cli.conftest import Cli
 from tests.support.files import ROOT
@@ -126,3 +127,59 @@ def test_exit_statuses_and_state_directory(tmp_path: Path, cli: Cli, monkeypatch
     assert state_dir(settings) == Path("/srv/imud")
     monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/imud:/var/lib/other")
     assert state_dir(settings) == Path("/var/lib/imud")
+
+
+CAN = "devices: {a: {driver: hipnuc-canopen, socketcan: {interface: '%s', backend: %s}}}\n"
+
+
+@pytest.mark.parametrize(
+    ("interface", "backend", "problem"),
+    [
+        ("0", "socketcand", "backend: expected a backend of python-can (canalystii, "),
+        ("0", "vector", "got vector, which needs Windows"),
+        ("0", "slcn", "did you mean slcan?"),
+        ("a/b", "socketcan", "interface: expected the name of a network interface, at most 15 bytes"),
+        ("x" * 40, "socketcan", "interface: expected the name of a network interface, at most 15 bytes"),
+        ("lo", "socketcan", "interface: expected a CAN interface, got lo"),
+        ("/dev/ttyACM0", "slcan", ""),
+        ("can0", "socketcan", ""),
+    ],
+)
+def test_check_of_can_keys(tmp_path: Path, cli: Cli, interface: str, backend: str, problem: str) -> None:
+    file = tmp_path / "imud.yaml"
+    file.write_text(CAN % (interface, backend))
+    result = cli("check", file, status=2 if problem else 0)
+    assert problem in result.err
+    assert (f"devices.a.socketcan.{'interface' if 'interface' in problem else 'backend'}" in result.err) is bool(
+        problem
+    )
+    assert "note" not in result.out
+
+
+@pytest.mark.parametrize(
+    ("interface", "problem", "note"),
+    [
+        ("lo", "interface: expected a CAN interface, got lo", ""),
+        ("a b", "interface: expected the name of a network interface", ""),
+        ("x" * 16, "interface: expected the name of a network interface", ""),
+        ("nosuch", "", "nmea2000.interface: nosuch does not exist: expected a CAN interface"),
+    ],
+)
+def test_check_of_nmea2000_interface(tmp_path: Path, cli: Cli, interface: str, problem: str, note: str) -> None:
+    file = tmp_path / "imud.yaml"
+    file.write_text(f"nmea2000: {{enabled: true, interface: '{interface}'}}\n" + CAN % ("can0", "socketcan"))
+    result = cli("check", file, status=2 if problem else 0)
+    assert problem in result.err
+    assert note in result.out
+    file.write_text("nmea2000: {enabled: false, interface: nosuch}\n" + CAN % ("can0", "socketcan"))
+    assert "nosuch" not in cli("check", file).out
+
+
+def test_check_notes_missing_library_of_backend(tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "imud.yaml"
+    for backend, library in (("kvaser", "libcanlib"), ("canalystii", "Python module canalystii")):
+        file.write_text(CAN % ("0", backend))
+        for is_installed in (False, True):
+            monkeypatch.setattr(can_backends, "find_library", lambda _name, is_present=is_installed: is_present or None)
+            monkeypatch.setattr(can_backends, "find_spec", lambda _name, is_present=is_installed: is_present or None)
+            assert (library in cli("check", file).out) is not is_installed

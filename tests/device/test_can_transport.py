@@ -169,6 +169,20 @@ async def test_lost_samples_are_counted_by_cause(bench: CanDeviceBench) -> None:
 
 
 @told(play)
+async def test_damaged_frames_of_adapter_are_gaps(bench: CanDeviceBench) -> None:
+    """The sender of a damaged frame is unknown. Each damaged frame is one gap of unknown size."""
+    bench.feed(1, 2)
+    bench.link.counters = KernelCounters(framing=2)
+    bench.rig.tick()
+    bench.rig.tick()
+    assert bench.rig.ledger.lost_unknown == 2
+    bench.feed(3)
+    bench.link.counters = KernelCounters(framing=3)
+    bench.rig.tick()
+    assert (bench.rig.ledger.lost_unknown, bench.rig.ledger.samples) == (3, 3)
+
+
+@told(play)
 async def test_frames_from_before_a_loss_are_not_mixed_with_those_after(bench: CanDeviceBench) -> None:
     first, second = bench.frames(1), bench.frames(2)
     second[2] = second[2]._replace(after_loss=True)

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
+from unittest.mock import Mock
 
 import pytest
 from gpiod.line import Bias, Clock, Direction, Drive, Value
@@ -347,3 +348,28 @@ def test_gpiod_of_the_environment_is_missing_or_that_of_libgpiod_1(monkeypatch: 
     monkeypatch.setitem(sys.modules, "gpiod", old)
     with pytest.raises(LinkError, match=r"2\.3 or later, got the module of libgpiod 1 \(/usr/lib.*Debian 12"):
         gpio.load_gpiod()
+
+
+@pytest.mark.parametrize("error", [RuntimeError("x"), SystemExit(0), asyncio.CancelledError()])
+@pytest.mark.parametrize("place", ["Chip", "request_lines", "get_value", "release"])
+def test_gpiod_errors(
+    gpiod: FakeGpiod, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str, error: BaseException
+) -> None:
+    """An exception of any class of gpiod becomes a LinkError, and close always succeeds."""
+    line = gpio.GpioInput(SOUT, devices=tmp_path)
+    if place in ("Chip", "request_lines"):
+        monkeypatch.setattr(gpiod, place, Mock(side_effect=error))
+        with pytest.raises(LinkError, match="cannot"):
+            line.open()
+    else:
+        line.open()
+        fake = gpiod.requests[0]
+        release = fake.release
+        monkeypatch.setattr(fake, place, Mock(side_effect=error))
+    if place == "get_value":
+        with pytest.raises(LinkError, match="cannot read"):
+            line.level()
+    line.close()
+    line.close()
+    if place == "release":
+        release()

@@ -1,8 +1,12 @@
 """The link to python-can, on its virtual bus."""
 
 import asyncio
+import contextlib
+import errno
+import struct
 import threading
 from collections.abc import Sequence
+from pathlib import Path
 from unittest.mock import Mock
 
 import can
@@ -10,10 +14,9 @@ import msgspec
 import pytest
 
 from imud.contracts.link import CanLink
-from imud.contracts.status import KernelCounters
 from imud.formats.can import CanFilter, CanFrame, CyclicFrame, pack_filters, pack_frame
 from imud.links import LINKS
-from imud.links.python_can import PythonCanLink
+from imud.links.python_can import DAMAGED_MAX, PythonCanLink
 from imud.links.socketcan import LINK, SocketCanOptions
 from imud.model.errors import LinkError
 from tests.support.daemon_process import LIMIT_S, wait_until
@@ -137,7 +140,7 @@ async def test_only_data_frames_are_delivered_and_nothing_after_close(monkeypatc
     wait_until(lambda: not bus.messages, "the thread has read the frame")
     link.close()
     await asyncio.sleep(0.01)  # the loop would deliver the frame now
-    assert (got, (bus.is_shut_down, bus.timeouts_s)) == ([[0, *range(3, 66)], [66]], (True, {0, 0.05}))
+    assert (got, (bus.is_shut_down, bus.timeouts_s)) == ([[0, *range(3, 64)], [64, 65, 66]], (True, {0, 0.05}))
 
 
 @in_loop
@@ -156,9 +159,142 @@ async def test_a_failed_bus_ends_a_link(monkeypatch: pytest.MonkeyPatch, closed:
     if closed:
         link.close()
     await asyncio.sleep(0)
-    assert ends == ([] if closed else [f"{link.title} ended: gone"])
+    assert ends == ([] if closed else [f"cannot receive on {link.title}: gone"])
     link.sender_failed(LinkError("full"))
-    assert (ends.pop(), link.kernel_counters()) == ("full", KernelCounters())
+    assert len(ends) == (not closed)  # the link reports its end once
+    assert link.kernel_counters().framing == (DAMAGED_MAX if kind is ValueError else 0)
+    link.close()
+
+
+@in_loop
+async def test_failed_cyclic_frame_ends_link(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(can, "Bus", lambda *_, **__: FakeBus())
+    link, ends = make("fake"), list[str]()
+    assert isinstance(link, PythonCanLink)
+    link.open()
+    link.start(lambda frames: None, lambda news, problem: None, lambda error: ends.append(str(error)))
+    for _ in range(2):
+        link.sender_failed(LinkError("full"))
+    assert ends == ["full"]
+    link.close()
+
+
+# Exceptions of python-can, of Python without the library of a vendor, and classes that usually end a program
+ERRORS: Sequence[BaseException] = (
+    can.CanOperationError("gone"),
+    can.CanInterfaceNotImplementedError("no library"),
+    OSError(errno.ENODEV, "No such device"),
+    NameError("name 'canGetNumberOfChannels' is not defined"),
+    AttributeError("module 'ctypes' has no attribute 'WinDLL'"),
+    struct.error("bad size"),
+    SystemExit(0),
+    KeyboardInterrupt(),
+    GeneratorExit(),
+    asyncio.CancelledError(),
+    StopIteration(),
+)
+
+
+class FailingBus(FakeBus):
+    """A bus that raises an exception at one place."""
+
+    def __init__(self, place: str, error: BaseException) -> None:
+        super().__init__()
+        setattr(self, place, Mock(side_effect=error))
+
+    def set_filters(self, _filters: object) -> None: ...
+
+
+FAILURES = [(backend, ERRORS[0]) for backend in can.interfaces.BACKENDS if backend not in ("socketcan", "socketcand")]
+FAILURES += [("slcan", error) for error in ERRORS]
+
+
+@pytest.mark.parametrize(("backend", "error"), FAILURES)
+@pytest.mark.parametrize("place", ["open", "recv", "send", "set_filters", "shutdown"])
+def test_exceptions_of_backends_become_link_errors(
+    monkeypatch: pytest.MonkeyPatch, place: str, backend: str, error: BaseException
+) -> None:
+    """At every place, an exception of any class ends only the link, and close always succeeds."""
+    bus = FailingBus(place, error)
+    bus_class = Mock(side_effect=error) if place == "open" else Mock(return_value=bus)
+    monkeypatch.setattr(can, "Bus", bus_class)
+    link, ends = make("fake", backend=backend), list[object]()
+
+    @in_loop
+    async def run() -> None:
+        if place == "open":
+            for wait in (True, False):
+                with pytest.raises(LinkError, match="cannot open fake"):
+                    await link.wait_present() if wait else link.open()
+            return
+        await link.wait_present()
+        link.open()
+        link.start(lambda frames: None, lambda news, problem: None, ends.append)
+        if place == "send":
+            with pytest.raises(LinkError, match="cannot send on fake"):
+                link.write(pack_frame(1, False, b""))
+            with pytest.raises(LinkError, match="cannot send on fake"):
+                link.send_cyclic([CyclicFrame(1, False, b"", 10**9)])
+        link.filters = [CanFilter(1, 1, False)]
+        for thread in [thread for thread in threading.enumerate() if place == "recv" and thread.name == "can fake"]:
+            thread.join()
+        await asyncio.sleep(0)
+        link.close()
+        link.close()
+        await asyncio.sleep(0)
+
+    run()
+    assert len(ends) == (place in ("recv", "set_filters"))
+    assert all(isinstance(end, LinkError) for end in ends)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("backend", list(can.interfaces.BACKENDS))
+def test_installed_backends_without_adapter(backend: str, tmp_path: Path) -> None:
+    """python-can without adapters and without libraries of vendors: LinkError, or a bus that needs no adapter."""
+    link = PythonCanLink(backend, str(tmp_path / "nosuch"), 500_000)
+    with contextlib.suppress(LinkError):
+        link.open()
+        assert backend in ("virtual", "udp_multicast")
+    link.close()
+
+
+class DamagedBus(FakeBus):
+    """A bus whose messages include exceptions, which `recv` raises."""
+
+    def __init__(self, *events: can.Message | Exception) -> None:
+        super().__init__()
+        self.events = list(events)
+        self._buffer = bytearray(b"\xff")
+
+    def recv(self, timeout_s: float) -> can.Message | None:
+        event = self.events.pop(0) if self.events else None
+        if isinstance(event, Exception):
+            raise event
+        return event
+
+
+@in_loop
+async def test_damaged_frames_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    undecodable = can.CanOperationError("Could not read from serial device")
+    undecodable.__cause__ = UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte")
+    frame = can.Message(arbitration_id=5, is_extended_id=False, data=b"12")
+    short = can.Message(arbitration_id=5, is_extended_id=False, data=b"1", dlc=2)
+    bus = DamagedBus(ValueError("invalid literal"), frame, undecodable, short, IndexError("range"), frame)
+    monkeypatch.setattr(can, "Bus", lambda *_, **__: bus)
+    link, ends, frames = make("fake", backend="slcan"), list[object](), list[CanFrame]()
+    link.open()
+    received = asyncio.Event()
+
+    def on_frames(batch: Sequence[CanFrame]) -> None:
+        frames.extend(batch)
+        received.set()
+
+    link.start(on_frames, lambda news, problem: None, ends.append)
+    await asyncio.wait_for(received.wait(), LIMIT_S)
+    assert ([frame.data for frame in frames], ends) == ([b"12", b"12"], [])
+    assert link.kernel_counters().framing == 4
+    assert bus._buffer == b""
     link.close()
 
 

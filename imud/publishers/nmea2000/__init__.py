@@ -3,12 +3,14 @@
 This module has only its options, so that an output that is off costs no import.
 """
 
+from collections.abc import Iterator
 from typing import Annotated, Final, Literal
 
 import msgspec
 
-from imud.contracts.link import Claim
+from imud.contracts.link import Claim, HostProblem
 from imud.contracts.publisher import PublisherType, make_later
+from imud.formats.can import interface_problem
 from imud.formats.nmea2000 import ADDRESS_LAST
 from imud.model.options import Options
 
@@ -23,7 +25,7 @@ class Nmea2000Options(Options, frozen=True, kw_only=True, forbid_unknown_fields=
 
     enabled: bool = False
     """Send messages."""
-    interface: Annotated[str, msgspec.Meta(min_length=1, max_length=15)] = "can0"
+    interface: Annotated[str, msgspec.Meta(min_length=1)] = "can0"
     """CAN interface of the NMEA 2000 network, 250 kbit/s."""
     device: str | None = None
     """Name of the device; null: the only device of the configuration."""
@@ -41,7 +43,9 @@ class Nmea2000Options(Options, frozen=True, kw_only=True, forbid_unknown_fields=
     messages of imud."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError without a message."""
+        """Raise ValueError without a message, and for an invalid name of an interface."""
+        if reason := interface_problem(self.interface):
+            raise ValueError(f"interface: {reason}")
         if not self.messages:
             raise ValueError("messages: expected at least one message, got none")
 
@@ -53,6 +57,19 @@ def _claims(settings: Nmea2000Options) -> list[Claim]:
     return [Claim(place=settings.interface, key="interface", shared=settings.share_interface, advice=advice)]
 
 
+def _host_problems(settings: Nmea2000Options) -> Iterator[HostProblem]:
+    """Yield the reason why this host has no such CAN interface."""
+    from imud.host import netlink  # late, because an output that is off costs no import
+
+    if misfit := netlink.misfit(settings.interface):
+        yield HostProblem("interface", *misfit)
+
+
 PUBLISHER: Final = PublisherType(
-    "nmea2000", Nmea2000Options, make_later("imud.publishers.nmea2000.output:Nmea2000"), claims=_claims, required=False
+    "nmea2000",
+    Nmea2000Options,
+    make_later("imud.publishers.nmea2000.output:Nmea2000"),
+    claims=_claims,
+    required=False,
+    host_problems=_host_problems,
 )

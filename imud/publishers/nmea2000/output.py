@@ -81,8 +81,8 @@ class Nmea2000:
         self._settings, self._context = settings, context
         self._paces = {PGNS[name]: Pace(rate_hz) for name, rate_hz in settings.messages.items()}
         self._device = VesselDevice(WHO, settings.device, round(NS_PER_S / max(settings.messages.values())), context)
-        preferred = context.kept.get(WHO, settings.address)
-        self._node = node = Node(self._identity(), preferred, context.clock.cpu_ns)
+        first_address = context.kept.get(WHO, settings.address)
+        self._node = node = Node(self._identity(), first_address, context.clock.cpu_ns)
         loopback = not settings.share_interface
         self._port = NodePort(node, settings.interface, context.clock.now_ns, loopback=loopback)
         self._newest_ns = 0
