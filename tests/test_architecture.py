@@ -145,6 +145,7 @@ LONG_MODULES = {
     "imud.cli.noise": "one report in three forms: text, JSON and HTML",
     "imud.cli.top": "the display of one command: table, details of a device, keys",
     "imud.device.settings": "one state machine: identity and settings of a device, with its comparison",
+    "imud.drivers.hipnuc.assembly": "one assembler: samples of a device, and the losses that SIDs and periods prove",
     "imud.drivers.imu61x.uart.settings": "the table of settings with its scripts",
     "imud.links.socketcan": "one link: options, bus state, socket, and frames with their times",
     "imud.publishers.metrics.families": "one table: the metric families",

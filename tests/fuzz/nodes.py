@@ -40,8 +40,8 @@ NAME: Final = nmea2000.pack_name(1000)
 IDENTITY: Final = NodeIdentity(NAME, nmea2000.pack_product("imud", "1", "1"), b"C" * 10, (HEADING,))
 ECHOED_FRAMES_MAX: Final = 32
 # Maximum number of sent frames in one second. Each PGN that imud sends on request has a pause of FRAME_PAUSE_NS for
-# each frame, and at most 20 frames before its first pause. Claims without a pause have the budget of all nodes, which is
-# full at the start of the second.
+# each frame, and at most 20 frames before its first pause. Claims without a pause have the budget of all nodes, which
+# is full at the start of the second.
 REPLY_PGNS: Final = 7
 FRAMES_PER_SECOND_MAX: Final = REPLY_PGNS * (NS_PER_S // FRAME_PAUSE_NS + 20) + 2 * EDGE_FACTOR * LIMITS.second_replies
 

@@ -10,7 +10,8 @@ one instant back to back (a burst), some devices send each kind by its own timer
 - A kind is *near* if it arrives within a quarter of a period of the anchor. The anchor waits for the near kinds that
   are due. A near frame that arrives more than half a period from the anchor is from another burst. It becomes a sample
   of its own, without the anchor. A kind that is not near waits for the next anchor.
-- A kind that arrives again ends the sample. imud ignores a copy: the same frame immediately after the frame.
+- A kind that arrives again ends the sample. imud ignores a copy: the same frame immediately after the frame, or the
+  copy of a gateway (`frame_copies.py`).
 - If the SIDs of two kinds agree, the SID decides in place of the time.
 - Until the anchor is known (LEARNING_STEPS periods), a sample ends when a kind arrives again, before the longest pause.
 - imud counts a lost sample only if the SID or the period of the anchor proves the loss (`SidSeries`, `Cadence`).
@@ -28,6 +29,7 @@ from typing import Final, NamedTuple
 
 import msgspec
 
+from imud.drivers.hipnuc.frame_copies import COPY_NS, REPETITION_NS, FrameCopies
 from imud.drivers.hipnuc.same_address import SameAddress
 from imud.model.ledger import Ledger
 from imud.model.sample import Measurement
@@ -268,7 +270,6 @@ class KindLosses:
         return missing
 
 
-COPY_NS: Final = 2 * NS_PER_MS  # maximum time from a frame to its copy, ns: a repetition by the bus
 # Number of frames near the anchor, less FAR_WEIGHT for each other frame, from which a kind is near
 NEAR_FRAMES: Final = 4
 NEAR_FRAMES_MAX, FAR_WEIGHT = 8, 4
@@ -373,6 +374,7 @@ class Assembly:
         self._allowed = kinds
         self._parts: dict[int, Part] = {}  # present sample by kind, in the order of arrival
         self._newest: tuple[int, bytes, int] | None = None  # kind, data and arrival of the newest frame
+        self._copies = FrameCopies()
         self._learning: list[tuple[int, int]] = []  # kinds and arrivals of the frames since the start of learning
         self._kinds: dict[int, _Kind] = {}
         self._anchor: int | None = None  # None: unknown
@@ -397,7 +399,7 @@ class Assembly:
 
     def add_frame(self, kind: int, data: bytes, t_rx_ns: int, sid: int | None = None) -> Sequence[Assembled]:
         """Add one frame. Return the samples that it completes, oldest first."""
-        if (self._allowed is not None and kind not in self._allowed) or self._is_copy(kind, data, t_rx_ns):
+        if (self._allowed is not None and kind not in self._allowed) or self._is_repeated(kind, data, t_rx_ns):
             self._ledger.frames_ignored += 1
             return ()
         self._newest = (kind, data, t_rx_ns)
@@ -434,18 +436,44 @@ class Assembly:
         self._parts.clear()
         self._due.clear()
         self._newest = None
+        self._copies.reset()
 
-    def _is_copy(self, kind: int, data: bytes, t_rx_ns: int) -> bool:
+    def _is_repeated(self, kind: int, data: bytes, t_rx_ns: int) -> bool:
+        """Return whether the bus or a gateway delivered a frame again."""
+        is_copy = self._copies.is_copy(kind, data, t_rx_ns)
+        if self._is_repetition(kind, data, t_rx_ns):
+            return True
+        if not is_copy:
+            return False
+        if self._anchor is None:
+            self._drop_learned_copies()
+            return True
+        known = self._kinds.get(kind)
+        # frames that waited arrive together
+        return known is None or 2 * known.behind_ns < max(known.every, 1) * self._cadence.period_ns
+
+    def _drop_learned_copies(self) -> None:
+        """Remove the copies from the frames of the learning, which arrived before the proof of copies."""
+        newest_ns: dict[int, int] = {}
+        frames = self._learning
+        self._learning = []
+        for kind, t_ns in frames:
+            if kind in newest_ns and t_ns - newest_ns[kind] < COPY_NS:
+                continue
+            newest_ns[kind] = t_ns
+            self._learning.append((kind, t_ns))
+
+    def _is_repetition(self, kind: int, data: bytes, t_rx_ns: int) -> bool:
         """Return whether the bus repeated the newest frame."""
         newest = self._newest
         if newest is None or newest[0] != kind or newest[1] != data:
             return False
         known, after_ns = self._kinds.get(kind), t_rx_ns - newest[2]
         if known is None or not known.every or self._anchor is None:
-            return after_ns < COPY_NS
+            return after_ns < REPETITION_NS
         period_ns = known.every * self._cadence.period_ns
         # frames that waited arrive together, and their data can be equal
-        return after_ns < min(COPY_NS, period_ns // 8) and 2 * known.behind_ns < period_ns
+        return after_ns < min(REPETITION_NS, period_ns // 8) and 2 * known.behind_ns < period_ns
 
     def _separates(self, kind: int, t_rx_ns: int, sid: int | None) -> bool:
         """Return whether a frame is from another burst than the present sample."""

@@ -31,7 +31,7 @@ import msgspec
 from imud.attitude.rotation import euler312_from_quat
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent, wrong_length
 from imud.contracts.driver import random_vector
-from imud.drivers.hipnuc.assembly import COPY_NS, KindLosses
+from imud.drivers.hipnuc.assembly import KindLosses
 from imud.drivers.hipnuc.assembly_state import KIND_LOSSES, SAME_ADDRESS
 from imud.drivers.hipnuc.common import (
     ACCEL_M_S2_PER_LSB,
@@ -46,6 +46,7 @@ from imud.drivers.hipnuc.common import (
     random_quaternion,
     vector_of,
 )
+from imud.drivers.hipnuc.frame_copies import REPETITION_NS
 from imud.drivers.hipnuc.j1939 import commands
 from imud.drivers.hipnuc.j1939.codec import (
     CONFIGURE,
@@ -137,7 +138,7 @@ class HipnucCanfdCodec(NodeCodec):
         ledger.bytes_in_good_frames += size
         ledger.frames_good += 1
         newest, newest_ns = self._newest.get(pgn, (b"", 0))
-        if data == newest and t_rx_ns - newest_ns < COPY_NS:  # a repetition by the bus
+        if data == newest and t_rx_ns - newest_ns < REPETITION_NS:  # a repetition by the bus
             ledger.frames_ignored += 1
             return ()
         self._newest[pgn] = data, t_rx_ns
