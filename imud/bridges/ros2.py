@@ -277,9 +277,10 @@ _STAMP: Final = {
 
 
 def time_of(utc_ns: int) -> tuple[int, int]:
-    """Return `sec` and `nanosec` of a time, limited to the range of `builtin_interfaces/Time`."""
-    sec, nanosec = divmod(utc_ns, NS_PER_S)
-    return max(-SEC_MAX, min(sec, SEC_MAX)), nanosec
+    """Return `sec` and `nanosec` of a time, at least 0, limited to the range of `builtin_interfaces/Time`."""
+    # a measurement before the first frame of a log that starts at 0 has a negative time, which ROS 2 rejects
+    sec, nanosec = divmod(max(utc_ns, 0), NS_PER_S)
+    return min(sec, SEC_MAX), nanosec
 
 
 def _imu(frames: MessageFrames, *, with_attitude: bool) -> Encoder:

@@ -142,6 +142,9 @@ IDENTIFIERS_MAX: Final = 4096  # maximum number of known identifiers
 FIRST: Final = 2  # number of known frames of each identifier
 DIFFERENCES_NS: Final = NS_PER_S  # maximum first time of a log of time differences, ns
 DIFFERENCES_LINES, DIFFERENCES_FALLS = 64, 3  # number of first lines and of their falls that show time differences
+EXCURSION_FRAMES: Final = 32  # maximum number of consecutive frames with wrong times
+EXCURSION_DISTANCES: Final = 8  # minimum number of correct distances before an excursion
+EXCURSION_NS: Final = 10 * NS_PER_MS  # minimum deviation of a wrong time from the usual distances, ns
 EQUAL_MIN: Final = 16  # minimum number of frames of a log whose times imud checks
 # Number of successive frames with one time that a bus cannot send in the resolution of the clock, nor an adapter hold
 STILL_FRAMES: Final = 256
@@ -242,6 +245,102 @@ class _TimeKind:
             )
 
 
+class LogLine(NamedTuple):
+    """Data frame of a log with its time, before imud removes steps of the clock."""
+
+    log_ns: int
+    number: int  # number of the line
+    frame: CanFrame  # without its time
+
+
+class _Excursions:
+    """Removal of wrong times that last for some frames: the clocks of two cores disagree, or a hardware time stamp is
+    wrong. The times then return to the times before. A pause and a step of the clock have no return.
+    """
+
+    def __init__(self) -> None:
+        self._newest_ns: int | None = None  # newest correct time
+        self._distances_ns: deque[int] = deque(maxlen=PAUSES_KEPT)
+        self._held: list[LogLine] = []  # lines with times that can be wrong
+        self._count = 0  # number of removed excursions
+        self._first = ""  # description of the first excursion
+
+    @property
+    def problem(self) -> str:
+        """The removed excursions; empty without one."""
+        more = f" and {self._count - 1} times later" if self._count > 1 else ""
+        return f"{self._first}{more} (clocks that disagree, corrected by imud)" if self._count else ""
+
+    def removed_from(self, lines: Iterable[LogLine]) -> Iterator[LogLine]:
+        """Yield the lines. Correct the times of an excursion."""
+        for line in lines:
+            if not self._held:
+                if self._may_start(line.log_ns):
+                    self._held.append(line)
+                else:
+                    self._accept(line.log_ns)
+                    yield line
+                continue
+
+            if self._is_return(line.log_ns):
+                yield from self._corrected(line.log_ns)
+                self._accept(line.log_ns)
+                yield line
+                continue
+
+            self._held.append(line)
+            if len(self._held) > EXCURSION_FRAMES:
+                yield from self._release()
+        yield from self._release()
+
+    def _accept(self, log_ns: int) -> None:
+        if self._newest_ns is not None:
+            self._distances_ns.append(max(log_ns - self._newest_ns, 0))
+        self._newest_ns = log_ns
+
+    def _may_start(self, log_ns: int) -> bool:
+        if self._newest_ns is None or len(self._distances_ns) < EXCURSION_DISTANCES:
+            return False
+        rise_ns = log_ns - self._newest_ns
+        return rise_ns < -DISORDER_NS or rise_ns > max(self._distances_ns) + EXCURSION_NS
+
+    def _is_return(self, log_ns: int) -> bool:
+        """Return whether a time continues the times before the held lines."""
+        if self._newest_ns is None:
+            return False
+        limit_ns = 2 * (len(self._held) + 1) * max(self._distances_ns) + EXCURSION_NS
+        is_near = -DISORDER_NS <= log_ns - self._newest_ns <= limit_ns
+        is_ahead = self._held[0].log_ns > self._newest_ns
+        step_ns = log_ns - self._held[-1].log_ns
+        return is_near and (step_ns < -DISORDER_NS if is_ahead else step_ns > DISORDER_NS)
+
+    def _corrected(self, return_ns: int) -> Iterator[LogLine]:
+        """Yield the held lines in the middle between the times before and after them."""
+        lines, self._held = self._held, []
+        start_ns = self._newest_ns or 0
+        room_ns = max(return_ns - start_ns, 0)
+        times_ns = [line.log_ns - lines[0].log_ns for line in lines]
+        if min(times_ns) < 0 or max(times_ns) > room_ns:
+            times_ns = [0] * len(lines)
+        first_ns = start_ns + (room_ns - max(times_ns)) // 2
+        shift_ns = lines[0].log_ns - first_ns
+        self._count += 1
+        if self._count == 1:
+            self._first = (
+                f"line {lines[0].number}: the times of {len(lines)} frames differ by {shift_ns / NS_PER_S:+.3f} s"
+            )
+        for line, time_ns in zip(lines, times_ns, strict=True):
+            self._accept(first_ns + time_ns)
+            yield line._replace(log_ns=first_ns + time_ns)
+
+    def _release(self) -> Iterator[LogLine]:
+        """Yield the held lines with their own times: a pause, or a step of the clock."""
+        lines, self._held = self._held, []
+        for line in lines:
+            self._accept(line.log_ns)
+            yield line
+
+
 class CandumpReader:
     """Reader of one interface of a candump log from a binary stream. Iterate once.
 
@@ -267,13 +366,16 @@ class CandumpReader:
         self._distances_ns: deque[int] = deque(maxlen=PAUSES_KEPT)
         self._times: dict[int, _Times] = {}  # times since the newest step by identifier
         self._kind = _TimeKind()
+        self._excursions = _Excursions()
 
     @property
     def problem(self) -> str:
         """Problems of the file after the iteration, one sentence; empty if there is no problem."""
         found = list(self._jumps)
-        if self._jump_count > len(found):
-            found.append(f"{self._jump_count - len(found)} more steps or pauses")
+        if self._excursions.problem:
+            found.append(self._excursions.problem)
+        if self._jump_count > len(self._jumps):
+            found.append(f"{self._jump_count - len(self._jumps)} more steps or pauses")
         if self._kind.problem:
             found.append(self._kind.problem)
         if self.bad_lines:
@@ -287,6 +389,19 @@ class CandumpReader:
 
     def __iter__(self) -> Iterator[CanFrame]:
         """Yield the frames of the interface. Raises BadArgument for several interfaces, or for an unknown interface."""
+        for line in self._excursions.removed_from(self._lines()):
+            can_id, extended, data, _, _ = line.frame
+            t_ns, is_jump = self._time(line.log_ns, line.number)
+            self._look_for_shift(can_id, t_ns, line.number)
+            frame = CanFrame(can_id, extended, data, t_ns, is_jump)
+            if len(self.identifiers) < IDENTIFIERS_MAX:
+                first = self.identifiers.setdefault((can_id, extended), [])
+                if len(first) < FIRST:
+                    first.append(frame)
+            yield frame
+
+    def _lines(self) -> Iterator[LogLine]:
+        """Yield the lines with data frames of the interface."""
         number = 0
         if not self.interface and self._file.seekable():
             self._choose_interface()
@@ -304,16 +419,9 @@ class CandumpReader:
             if can_id > EXTENDED_ID_MAX or (len(digits) == 3 and can_id > STANDARD_ID_MAX):
                 self._note(b"bad", number, passed=bool(can_id & ERROR_FLAG))
                 continue
-            if not self._is_own(_text(name)):
-                continue
-            t_ns, is_jump = self._time(int(seconds) * NS_PER_S + int(fraction.ljust(9, b"0")), number)
-            self._look_for_shift(can_id, t_ns, number)
-            frame = CanFrame(can_id, len(digits) == 8, data, t_ns, is_jump)
-            if len(self.identifiers) < IDENTIFIERS_MAX:
-                first = self.identifiers.setdefault((can_id, frame.extended), [])
-                if len(first) < FIRST:
-                    first.append(frame)
-            yield frame
+            if self._is_own(_text(name)):
+                log_ns = int(seconds) * NS_PER_S + int(fraction.ljust(9, b"0"))
+                yield LogLine(log_ns, number, CanFrame(can_id, len(digits) == 8, data, 0))
         self._kind.end()
         if self._others and not self._has_frames:
             raise BadArgument(f"interface {self.interface}: expected {_listed(self._others, 'or')}, as in the log")

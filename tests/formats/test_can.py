@@ -2,13 +2,14 @@
 
 import io
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from random import Random
 
 import pytest
 
 from imud.formats import can
 from imud.model.errors import BadArgument
+from imud.model.units import NS_PER_MS, NS_PER_S
 from tests.support.files import candump_line
 
 
@@ -157,3 +158,39 @@ def test_what_is_written_is_read() -> None:
     assert candump_line(can.CanFrame(0x65, False, b"\xab", 1_500_000_000)) == "(0000000001.500000) can0 065#AB\n"
     with pytest.raises(ValueError, match="invalid CAN frame"):
         candump_line(can.CanFrame(0x800, False, b"", 0))
+
+
+def _log(ahead_s: Callable[[int], float], samples: int = 300) -> list[can.CanFrame]:
+    """Return the frames of a log: four frames each 10 ms. `ahead_s` is the error of the times of a sample."""
+    lines = [
+        f"({10_000 + sample * 0.01 + ahead_s(sample) + place * 0.0003:.6f}) can0 1{place:02X}#00"
+        for sample in range(samples)
+        for place in range(4)
+    ]
+    return list(can.CandumpReader(io.BytesIO("\n".join(lines).encode())))
+
+
+@pytest.mark.parametrize("ahead_s", [6.0, 0.05, -6.0, -0.05, 4000.0, -4000.0])
+@pytest.mark.parametrize("every", [10, 100, 299])
+def test_times_of_disagreeing_clocks(ahead_s: float, every: int) -> None:
+    frames = _log(lambda sample: ahead_s * (sample % every == every // 2))
+    true_ns = [frame.t_rx_ns for frame in _log(lambda _sample: 0.0)]
+    assert not any(frame.after_loss for frame in frames)
+    assert max(abs(frame.t_rx_ns - t_ns) for frame, t_ns in zip(frames, true_ns, strict=True)) <= NS_PER_MS
+
+
+def test_excursion_is_reported() -> None:
+    lines = [f"({1000 + count * 0.01 + 6 * (count == 50):.6f}) can0 101#00" for count in range(100)]
+    reader = can.CandumpReader(io.BytesIO("\n".join(lines).encode()))
+    assert len(list(reader)) == 100
+    assert reader.problem == (
+        "line 51: the times of 1 frames differ by +6.000 s (clocks that disagree, corrected by imud)"
+    )
+
+
+@pytest.mark.parametrize("rise_s", [0.5, 6.0])
+def test_pause_is_kept(rise_s: float) -> None:
+    """A pause and lost frames have no return of the times."""
+    frames = _log(lambda sample: rise_s * (sample >= 100))
+    span_ns = frames[-1].t_rx_ns - frames[0].t_rx_ns
+    assert span_ns == round((2.99 + 0.0009 + rise_s) * NS_PER_S)
