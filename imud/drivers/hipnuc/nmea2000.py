@@ -3,8 +3,9 @@
     09F112ss  127250 Vessel Heading     09F113ss  127251 Rate of Turn     0DF119ss  127257 Attitude
 
 ss is the address of the sender, which NMEA 2000 can change each time the bus is assembled. `source: auto` selects the
-first sender of these messages and keeps it; after SILENT_NS without a message, it selects the next sender. imud claims
-no address and sends no requests.
+first sender of these messages and keeps it. The sender claims each new address with its NAME (60928), and imud follows
+the NAME. If the NAME is unknown, imud follows a claim after which only the new address sends. After SILENT_NS without a
+message, imud selects the next sender, and counts a gap of unknown size. imud claims no address and sends no requests.
 
 Messages of one instant should have the same SID. Real senders also number each PGN independently, or send a constant
 SID. `assembly.py` makes samples by the period of each PGN, and uses SIDs only while they agree.
@@ -33,6 +34,8 @@ from imud.formats import nmea2000
 from imud.formats.can import CanFilter, CanFrame
 from imud.formats.j1939 import (
     ADDRESS_MAX,
+    CLAIMED,
+    GLOBAL,
     WITHOUT_PRIORITY,
     J1939Id,
     all_of,
@@ -51,6 +54,7 @@ from imud.formats.nmea2000 import (
     I16_MOST,
     I32_MOST,
     MESSAGE_BYTES,
+    NAME_BYTES,
     PRIORITIES,
     RAD_PER_LSB,
     RATE_LAYOUT,
@@ -150,9 +154,11 @@ def pack_attitude(sid: int, euler_rad: Vector3, *, has_yaw: bool = True) -> byte
 
 # Time without a message after which imud selects another sender, ns. The slowest message has a period of 1 s.
 SILENT_NS: Final = 3 * NS_PER_S
+MOVED_PERIODS: Final = 2  # minimum silence of the previous address in periods, if the NAME of the sender is unknown
 SENDERS_SHOWN: Final = 8  # maximum number of other senders in a text
 
 _PGNS: Final = {join(J1939Id(0, pgn, 0)): pgn for pgn in PGNS}  # PGN by identifier without priority and source
+_CLAIM: Final = join(J1939Id(0, CLAIMED, 0))  # identifier of a claim without priority and source
 _REFERENCES: Final = {"true": Reference.TRUE, "magnetic": Reference.MAGNETIC, "auto": None}
 
 
@@ -191,15 +197,21 @@ class HipnucNmea2000Codec:
         self.ledger = ledger
         self._fixed = None if settings.source == "auto" else settings.source
         self._wanted_reference = _REFERENCES[settings.heading]
-        self._set_sender(self._fixed)
+        self._source: int | None = None  # address of the sender; None if it is unknown
         self._heard_ns = 0
         self._frames: dict[int, int] = {}  # number of frames by source, at most 2; empty if options.source is set
+        self._frame_ns: dict[int, int] = {}  # arrival of the newest frame by source
+        self._names: dict[int, bytes] = {}  # NAME of the owner of each address, from claims
+        self._claim: tuple[int, int] | None = None  # address and time of the newest claim of another address
+        self._name: bytes | None = None  # NAME of the sender; None if it is unknown
+        self._is_displaced = False  # whether another node has the address of the sender
+        self._set_sender(self._fixed)
         self.unknown: dict[int, int] = {}  # number of frames by unknown PGN
 
     @property
     def problem(self) -> str:
         """Return the address conflict, or the other senders that the frames show; empty without them."""
-        others = [f"source {source}" for source in self._frames if source != self._source and self._frames[source] > 1]
+        others = [f"source {source}" for source in self._frames if self._is_other(source)]
         if not others:
             return self._assembly.problem
         more = f" and {len(others) - SENDERS_SHOWN} more" * (len(others) > SENDERS_SHOWN)
@@ -213,7 +225,12 @@ class HipnucNmea2000Codec:
         """Add one frame. Return the completed events. Never raises an exception."""
         ledger, size = self.ledger, len(data)
         ledger.bytes_in += size
-        pgn = _PGNS.get(can_id & WITHOUT_PRIORITY & ~0xFF) if extended else None
+        group_id = can_id & WITHOUT_PRIORITY & ~0xFF
+        pgn = _PGNS.get(group_id) if extended else None
+        if pgn is None and extended and group_id == _CLAIM and self._fixed is None:
+            ledger.bytes_skipped += size
+            self._add_claim(can_id & 0xFF, data, t_rx_ns)
+            return ()
         if pgn is None or not self._is_sender(can_id & 0xFF, t_rx_ns):
             ledger.bytes_skipped += size
             if pgn is None and extended and self._source in (None, can_id & 0xFF):
@@ -240,22 +257,64 @@ class HipnucNmea2000Codec:
 
     # --- selection of sender and reference --------------------------------------------------------------------------
 
+    def _is_other(self, source: int) -> bool:
+        """Return whether a second sender uses this address now."""
+        is_sending = self._heard_ns - self._frame_ns.get(source, 0) <= SILENT_NS
+        return source != self._source and self._frames[source] > 1 and is_sending
+
     def _is_sender(self, source: int, t_rx_ns: int) -> bool:
         if self._fixed is None and source <= ADDRESS_MAX:
             self._frames[source] = min(self._frames.get(source, 0) + 1, 2)
-        if source != self._source:
-            silent = t_rx_ns - self._heard_ns > SILENT_NS
-            if self._fixed is not None or source > ADDRESS_MAX or (self._source is not None and not silent):
+            self._frame_ns[source] = t_rx_ns
+        if source != self._source or self._is_displaced:
+            silent_ns = t_rx_ns - self._heard_ns
+            if self._fixed is not None or source > ADDRESS_MAX:
                 return False
-            self._assembly.reset()
-            self._set_sender(source)
+            if self._has_moved_to(source, silent_ns):
+                self._source = source
+                self._name = self._names.get(source)
+            elif self._source is None or silent_ns > SILENT_NS:
+                if self._source is not None:
+                    self.ledger.add_unknown_gap()
+                self._assembly.reset()
+                self._set_sender(source)
+            else:
+                return False
         self._heard_ns = t_rx_ns
         return True
+
+    def _add_claim(self, source: int, name: bytes, t_rx_ns: int) -> None:
+        """Store the NAME of an address. Follow the sender if it claims another address."""
+        if len(name) != NAME_BYTES or source > ADDRESS_MAX:
+            return
+        # a node has one address: it left its previous address
+        self._names = {address: owner for address, owner in self._names.items() if owner != name}
+        self._names[source] = name
+        if name == self._name:
+            if self._source is not None and source != self._source:
+                self._frames.pop(self._source, None)
+            self._source = source
+            self._is_displaced = False
+        elif source != self._source:
+            self._claim = (source, t_rx_ns)
+        elif self._name is None:
+            self._name = name
+        elif int.from_bytes(name, "little") < int.from_bytes(self._name, "little"):
+            self._is_displaced = True  # a node with a higher priority takes the address of the sender
+
+    def _has_moved_to(self, source: int, silent_ns: int) -> bool:
+        """Return whether the sender, whose NAME is unknown, claimed this address and left its previous address."""
+        if self._claim is None or self._name is not None or self._claim[0] != source:
+            return False
+        period_ns = self._assembly.period_ns
+        return self._heard_ns <= self._claim[1] and 0 < MOVED_PERIODS * period_ns <= silent_ns
 
     def _set_sender(self, source: int | None) -> None:
         """Start again with this sender."""
         self._source = source
-        self._assembly = Assembly(self.ledger)
+        self._name = self._names.get(source) if source is not None else None
+        self._is_displaced = False
+        self._assembly: Assembly = Assembly(self.ledger)
         self._reference = self._wanted_reference
         self._has_heading = False
 
@@ -295,7 +354,9 @@ def _example_frames(random: Random) -> list[CanFrame]:
 
 def _filters(settings: HipnucNmea2000Options) -> list[CanFilter]:
     source = None if settings.source == "auto" else settings.source
-    return [filter_of(pgn, source) for pgn in PGNS]
+    filters = [filter_of(pgn, source) for pgn in PGNS]
+    # without a configured address, imud follows the claims of the sender
+    return filters if source is not None else [*filters, filter_of(CLAIMED, None, GLOBAL)]
 
 
 def _sent_by(settings: HipnucNmea2000Options) -> list[CanFilter]:
