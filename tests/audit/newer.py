@@ -41,7 +41,7 @@ C 2 bits 9 and 19 | inclination and node identifier, not published | drivers.hip
 C 2 bits 25 to 29 | internal: the frame is rejected and counted | drivers.hipnuc.uart.ins:KNOWN_BITS | {_INS}test_internal_and_unknown_bits_are_rejected
 C 2 bits 30 and 31 | position and velocity of the receiver alone, not published | drivers.hipnuc.uart.ins:FIELDS | {_INS}test_each_field_of_hi83_alone_and_at_its_place
 C 3 CAN FD | frames of up to 64 bytes on SocketCAN, python-can and in candump logs | links.socketcan:open_raw | links/test_socketcan.py::test_a_read_is_bounded_and_frames_come_with_the_time_of_their_arrival links/test_python_can.py::test_frames_pass_the_filters_in_the_loops_thread_and_commands_go_out formats/test_can.py::test_lines_of_candump lab/test_hipnuc_can.py::test_can_fd_samples_of_a_found_device_and_a_change
-C 3 FF5B fields | the fields of HI83 with the bits 0 to 6 and 8, padding | drivers.hipnuc.canfd:HipnucCanfdCodec | {_FD}test_the_newer_frame_by_hand {_FD}test_every_possible_bitmap_has_the_shortest_length_of_can_fd
+C 3 FF5B fields | the fields of HI83 with the bits 0 to 6 and 8, padding | drivers.hipnuc.canfd:HipnucCanfdCodec | {_FD}test_the_newer_frame_by_hand {_FD}test_every_bitmap_has_shortest_length_or_64_bytes
 C 3 FF5B bitmap | other bits, or another length, make the frame bad | drivers.hipnuc.canfd:KNOWN_BITS | {_FD}test_a_bitmap_that_does_not_match_makes_a_frame_bad
 C 3 FF5B sequence | proves losses | drivers.hipnuc.canfd:HipnucCanfdCodec | {_FD}test_the_sequence_number_proves_losses_and_copies_are_ignored sampling/test_path.py::test_a_loss_that_the_codec_counts_is_not_counted_by_the_clock
 C 3 FF5A | 64 bytes of older firmware | drivers.hipnuc.canfd:OLD | {_FD}test_the_older_frame_by_hand

@@ -12,8 +12,8 @@
     | status | 0    | time ms | accel | gyro | mag  | roll pitch yaw i32| quaternion | temperature | 0 |
     +--------+------+---------+-------+------+------+-------------------+------------+-------------+---+
 
-Otherwise 16 bits, little-endian, with the scales of J1939. The padding fills the frame up to the next length of CAN FD;
-imud ignores its values. A bitmap with other bits, or a length that does not match the bitmap, makes the frame bad. The
+Otherwise 16 bits, little-endian, with the scales of J1939. The padding fills the frame up to the next length of CAN FD,
+or to 64 bytes; imud ignores its values. A bitmap with other bits, or another length, makes the frame bad. The
 address, the registers and the requests of `j1939` also apply to these devices (assumption: the intervals of FF5A and
 FF5B have registers at the same offset as the intervals of the other messages).
 
@@ -129,7 +129,9 @@ class HipnucCanfdCodec(NodeCodec):
                 ledger.bytes_in_bad_frames += size
                 ledger.frames_bad_content += 1
                 return (BadFrame(BadReason.CONTENT, data, can_id),)
-            is_length = size >= HEAD.size and size == padded(ins.hi83_size(bitmap))
+            # The documents allow "padding up to a valid CAN FD length". The vendor's parsers check a minimum length.
+            shortest = padded(ins.hi83_size(bitmap))
+            is_length = shortest >= HEAD.size and size in (shortest, FD_DATA_BYTES_MAX)
             sequence = data[HEAD.size - 1] if is_length else None
         else:
             is_length = size == OLD.size
