@@ -198,8 +198,8 @@ CLAIMS: list[tuple[str, dict[str, object], tuple[object, ...]]] = [
     ("rs485", {"line": "/dev/b", "address": 7}, ("/dev/b", "line", True, 7, "address", TERMS)),
     ("rs485", {"line": "/dev/b"}, ("/dev/b", "line", True, None, "address", TERMS)),
     ("socketcan", {"interface": "can0"}, ("can0", "interface", True, None, "", NO_RATES)),
-    ("socketcan", {"interface": "1", "backend": "x"}, ("1 (x)", "interface", True, None, "", NO_RATES)),
-    ("socketcan", {"interface": "/d", "backend": "x"}, ("/d", "interface", False, None, "", NO_RATES)),
+    ("socketcan", {"interface": "1", "backend": "slcan"}, ("1 (slcan)", "interface", True, None, "", NO_RATES)),
+    ("socketcan", {"interface": "/d", "backend": "slcan"}, ("/d", "interface", False, None, "", NO_RATES)),
 ]
 
 
