@@ -43,8 +43,9 @@ GROUPS: Final = {
     "script": "tests.fuzz.scripts", "config": "tests.fuzz.configuration", "socket": "tests.fuzz.rpc",
     "file": "tests.fuzz.files", "shm": "tests.fuzz.shm", "utc": "tests.fuzz.utc", "http": "tests.fuzz.scrape",
     "mqtt": "tests.fuzz.broker", "fleet": "tests.fuzz.fleet", "command": "tests.fuzz.commands",
-    "ros2": "tests.fuzz.dds", "influx": "tests.fuzz.influx", "state": "tests.fuzz.state", "client": "tests.fuzz.answers",
-    "firmware": "tests.fuzz.firmware", "peer": "tests.fuzz.peers", "node": "tests.fuzz.nodes",
+    "ros2": "tests.fuzz.dds", "influx": "tests.fuzz.influx", "state": "tests.fuzz.state",
+    "client": "tests.fuzz.answers", "firmware": "tests.fuzz.firmware", "peer": "tests.fuzz.peers",
+    "node": "tests.fuzz.nodes",
 }  # fmt: skip
 """Module of each group. `names` returns the names of its targets. `make` makes a target and imports the tested code, so
 that only the code of this target is instrumented."""

@@ -65,8 +65,8 @@ def test_token_and_ca_file_are_fifos(tmp_path: Path) -> None:
         url = post_url(database.url)
         assert url is not None
         for delivery in (
-            HttpPost(url, PostAccess(token_file=str(fifo))),
-            HttpPost(url._replace(tls=True), PostAccess(ca_file=str(fifo))),
+            HttpPost(url, PostAccess(token_file=str(fifo)), VirtualClock().now_ns),
+            HttpPost(url._replace(tls=True), PostAccess(ca_file=str(fifo)), VirtualClock().now_ns),
         ):
             with pytest.raises(OSError, match="is a FIFO, expected a regular file"):
                 delivery.post(BODY)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, Final
 
-from imud.drivers.hipnuc import assembly, same_address
+from imud.drivers.hipnuc import assembly, frame_copies, same_address
 from imud.drivers.hipnuc.assembly import Cadence, Part
 from imud.drivers.state import COUNT, DAEMON, FLAG, NUMBER, OPTIONS, SID, TIME
 from imud.formats.state import Data, Each, Field, Integer, Items, Map, Maybe, New, Row, StateError, StateTable, Values
@@ -121,6 +121,17 @@ SAME_ADDRESS: Final = StateTable(
 )
 
 
+_NEWEST: Final = Row(Data(FRAME_BYTES_MAX), TIME, Integer(-1, 1 << 61), FLAG, make=frame_copies.NewestFrame)
+COPIES: Final = StateTable(
+    (
+        Field(1, "_arrival_ns", Map(KIND, TIME, KINDS_MAX)),
+        Field(2, "_is_proven", FLAG),
+        Field(3, "_kind", Maybe(KIND)),
+        Field(4, "_newest", Map(KIND, _NEWEST, KINDS_MAX)),
+    )
+)
+
+
 def _finish_assembly(value: Any) -> None:
     kinds, parts, anchor = value._kinds, value._parts, value._anchor
     known = {kind for kind, _ in value._learning} if anchor is None else kinds.keys()
@@ -143,6 +154,7 @@ ASSEMBLY: Final = StateTable(
         Field(11, "_strays", Integer(0, assembly.STRAYS_MAX + assembly.STRAY_WEIGHT)),
         Field(12, "_same_address", SAME_ADDRESS),
         Field(13, "_incomplete", COUNT),
+        Field(14, "_copies", COPIES),
     ),
     {"_ledger": DAEMON, "_allowed": OPTIONS},
     _finish_assembly,

@@ -18,7 +18,7 @@ COPY_NS: Final = 3 * NS_PER_MS  # maximum time from a frame to its copy, ns: a g
 UNKNOWN: Final = -1
 
 
-class _Newest(NamedTuple):
+class NewestFrame(NamedTuple):
     """Newest frame of a kind that is not a copy."""
 
     data: bytes
@@ -33,7 +33,7 @@ class FrameCopies:
     __slots__ = ("_arrival_ns", "_is_proven", "_kind", "_newest")
 
     def __init__(self) -> None:
-        self._newest: dict[int, _Newest] = {}
+        self._newest: dict[int, NewestFrame] = {}
         self._arrival_ns: dict[int, int] = {}  # time of the newest frame of each kind, copies included
         self._kind: int | None = None  # kind of the newest frame
         self._is_proven = False  # whether a frame with new data arrived twice
@@ -46,7 +46,7 @@ class FrameCopies:
         self._arrival_ns[kind] = t_ns
         self._kind = kind
         if newest is None or arrival_ns is None:
-            self._newest[kind] = _Newest(data, t_ns, UNKNOWN, False)
+            self._newest[kind] = NewestFrame(data, t_ns, UNKNOWN, False)
             return False
 
         distance_ns = t_ns - newest.t_ns
@@ -59,7 +59,7 @@ class FrameCopies:
                 self._is_proven = is_equal and (self._is_proven or newest.is_new)
                 if self._is_proven:
                     return True
-        self._newest[kind] = _Newest(data, t_ns, t_ns - arrival_ns, not is_equal)
+        self._newest[kind] = NewestFrame(data, t_ns, t_ns - arrival_ns, not is_equal)
         return False
 
     def reset(self) -> None:

@@ -63,7 +63,7 @@ from imud.formats.nmea2000 import (
     SID_MOST,
     Reference,
 )
-from imud.formats.state import Field, Integer, Map, Maybe, StateTable, member_of
+from imud.formats.state import Data, Field, Integer, Map, Maybe, Row, StateTable, member_of
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import Measurement, Vector3
@@ -172,6 +172,8 @@ class HipnucNmea2000Options(Options, frozen=True, kw_only=True, forbid_unknown_f
     """Heading to use if the sender sends two; `auto` = the first received reference."""
 
 
+_ADDRESS: Final = Integer(0, ADDRESS_MAX)
+_NAME: Final = Data(NAME_BYTES, NAME_BYTES)
 _SIZES: Final = dict.fromkeys(PGNS, MESSAGE_BYTES)  # length of the messages of a sample, bytes
 
 
@@ -181,13 +183,18 @@ class HipnucNmea2000Codec:
     counts_losses = True
     STATE: ClassVar = StateTable(
         (
-            Field(1, "_source", Maybe(Integer(0, ADDRESS_MAX))),
+            Field(1, "_source", Maybe(_ADDRESS)),
             Field(2, "_assembly", ASSEMBLY),
             Field(3, "_reference", Maybe(member_of(Reference))),
             Field(4, "_has_heading", FLAG),
             Field(5, "_heard_ns", TIME),
-            Field(6, "_frames", Map(Integer(0, ADDRESS_MAX), Integer(0, 2), ADDRESS_MAX + 1)),
+            Field(6, "_frames", Map(_ADDRESS, Integer(0, 2), ADDRESS_MAX + 1)),
             Field(7, "unknown", UNKNOWN),
+            Field(8, "_frame_ns", Map(_ADDRESS, TIME, ADDRESS_MAX + 1)),
+            Field(9, "_names", Map(_ADDRESS, _NAME, ADDRESS_MAX + 1)),
+            Field(10, "_claim", Maybe(Row(_ADDRESS, TIME))),
+            Field(11, "_name", Maybe(_NAME)),
+            Field(12, "_is_displaced", FLAG),
         ),
         {"ledger": DAEMON, "_fixed": OPTIONS, "_wanted_reference": OPTIONS},
         lambda codec: check_parts(codec._assembly, _SIZES),
