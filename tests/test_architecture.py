@@ -442,6 +442,58 @@ def test_tests_write_no_private_members() -> None:
     assert not wrong, wrong
 
 
+# --- names from outside -------------------------------------------------------------------------------------------
+
+IMPORTERS = {
+    "imud.cli": "the table of commands",
+    "imud.cli.analysis": "names of modules in the code",
+    "imud.config.parts": "a constant",
+    "imud.contracts.registry": "the fixed rows of a registry",
+    "imud.fleet.broker": "a constant",
+    "imud.formats.kernel": "a constant",
+    "imud.publishers.signalk.server": "a constant",
+    "imud.sampling.attitude": "a constant",
+    "imud.sampling.path": "a constant",
+}
+"""Modules that import by a name at run time, and the source of the name. A file, a peer or a configuration is never the
+source."""
+EXECUTORS = {"eval", "exec", "compile", "__import__"}
+OBJECT_FORMATS = {"pickle", "marshal", "shelve", "dill", "jsonpickle", "multiprocessing"}
+SETTERS = {
+    "imud.fleet.broker": "names of callbacks and properties in the code",
+    "imud.fleet.database.transaction": "fields of a struct",
+    "imud.formats.state": "fields of a table",
+    "imud.links.serial_port": "names in the code",
+    "imud.model.ledger": "LEDGER_FIELDS",
+    "imud.publishers.rules.limit": "__slots__",
+    "imud.recording.calls": "LEDGER_FIELDS",
+    "imud.recording.player": "FROM_OUTSIDE",
+}
+"""Modules that set an attribute by name, and the source of the name."""
+
+
+def test_data_select_no_module_and_no_code() -> None:
+    """Foreign data create values only. Before you add a module, check that no name comes from outside."""
+    importers, setters, wrong = set(), set(), []
+    for module, path in MODULES.items():
+        for node in ast.walk(tree_of(path)):
+            if isinstance(node, ast.Name | ast.Attribute) and ast.unparse(node).rpartition(".")[2] == "import_module":
+                importers.add(module)
+            elif isinstance(node, ast.Call):
+                name = ast.unparse(node.func).rpartition(".")[2]
+                is_built_in = isinstance(node.func, ast.Name)
+                if name in ("setattr", "__setattr__"):
+                    setters.add(module)
+                elif is_built_in and name in EXECUTORS:
+                    wrong.append(f"{module}: {name}")
+            elif isinstance(node, ast.Import | ast.ImportFrom):
+                names = [node.module or ""] if isinstance(node, ast.ImportFrom) else [one.name for one in node.names]
+                wrong += [f"{module}: {name}" for name in names if name.partition(".")[0] in OBJECT_FORMATS]
+    assert not wrong, wrong
+    assert importers == IMPORTERS.keys()
+    assert setters == SETTERS.keys()
+
+
 # --- a test by the path of its module ---------------------------------------------------------------------------------
 
 ELSEWHERE = (

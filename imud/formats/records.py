@@ -37,6 +37,17 @@ _AFTER_LOSS: Final = 2
 NO_DEVICE: Final = 0xFFFF  # device number of records about all devices
 
 
+# Maximum absolute value of a time, ns: 73 years. Sums and differences of two times then have 64 bits. Times of a replay
+# can be negative.
+TIME_MAX_NS: Final = 1 << 61
+UTC_OFFSET_MAX_NS: Final = 1 << 62  # maximum of CLOCK_REALTIME minus CLOCK_MONOTONIC, ns: until the year 2116
+COUNT_MAX: Final = 1 << 53  # maximum of a counter
+PERIOD_MAX_NS: Final = 3_600_000_000_000  # maximum time between two reads of a polled device, ns
+Time = Annotated[int, Meta(ge=-TIME_MAX_NS, le=TIME_MAX_NS)]
+Count = Annotated[int, Meta(ge=0, le=COUNT_MAX)]
+Utc = Annotated[int, Meta(ge=-UTC_OFFSET_MAX_NS, le=UTC_OFFSET_MAX_NS)]
+
+
 class Kind(IntEnum):
     """Kinds of records."""
 
@@ -72,8 +83,8 @@ class SessionRecord(msgspec.Struct, frozen=True):
     host: str  # name and kernel of the host
     epoch: int  # random number of the start of the daemon, equal in all files of one run
     number: int  # number of the file in one recording, starting at 0
-    t_ns: int  # CLOCK_MONOTONIC at the start of the file
-    utc_ns: int  # CLOCK_REALTIME at the start of the file
+    t_ns: Time  # CLOCK_MONOTONIC at the start of the file
+    utc_ns: Utc  # CLOCK_REALTIME at the start of the file
 
 
 # A name outside this pattern is forged: it could control the terminal of a program that prints it
@@ -91,16 +102,6 @@ class DeviceRecord(msgspec.Struct, frozen=True):
     configuration: dict[str, Any]  # configuration of the device with defaults: link, options, lines, frame, convention
     identity: dict[str, str]
     settings: dict[str, str]
-
-
-# Maximum absolute value of a time, ns: 73 years. Sums and differences of two times then have 64 bits. Times of a replay
-# can be negative.
-TIME_MAX_NS: Final = 1 << 61
-UTC_OFFSET_MAX_NS: Final = 1 << 62  # maximum of CLOCK_REALTIME minus CLOCK_MONOTONIC, ns: until the year 2116
-COUNT_MAX: Final = 1 << 53  # maximum of a counter
-PERIOD_MAX_NS: Final = 3_600_000_000_000  # maximum time between two reads of a polled device, ns
-Time = Annotated[int, Meta(ge=-TIME_MAX_NS, le=TIME_MAX_NS)]
-Count = Annotated[int, Meta(ge=0, le=COUNT_MAX)]
 
 
 class PathRecord(msgspec.Struct, frozen=True):
@@ -190,8 +191,8 @@ class LostRecord(NamedTuple):
 class EndRecord(msgspec.Struct, frozen=True):
     """End of a file."""
 
-    t_ns: int
-    utc_ns: int
+    t_ns: Time
+    utc_ns: Utc
     reason: str
 
 

@@ -240,6 +240,8 @@ class Player:
         self._on_session = on_session
         self._host = PlayedClock()
         self._epoch: int | None = None  # run of the newest file; None before the first
+        # Whether the replay can equal the live run: not with new clocks on request
+        self.is_comparable = not fresh
         # reason to ignore recorded states; empty if the player uses them
         self._no_state = "a new clock was requested" if fresh else ""
         self._no_host_state = ""  # reason to ignore the states of devices: the state of the host clocks is not usable

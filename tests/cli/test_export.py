@@ -248,7 +248,7 @@ def test_the_noise_of_a_device_that_is_described_after_samples_of_another_one(tm
     for record in [*(one for one in records if one is not late and one.device != late.device), late]:
         data += gatherer.add(encode(Kind(record.kind), record.device, record.body))
     for number, target in enumerate(("host", "clock")):  # only the first is the state of the host's clocks
-        call = CallRecord(target, "restore", [None, 7_000_000_000 + number, 1 + number])
+        call = CallRecord(target, "restore", [b"", 7_000_000_000 + number, 1 + number])
         data += gatherer.add(encode(Kind.CALL, NO_DEVICE, msgspec.msgpack.encode(call)))
     facts = recorded_facts(BytesIO(data + gatherer.finish()), "a")
     assert facts.noise == {"mast": Deviations(gyro_rad_s=0.5)}
