@@ -37,11 +37,10 @@ def file_of(data: Sequence[bytes]) -> bytes:
 def objects_by_name(command: bytes) -> bytes:
     """Return a state with names of classes and functions, as before the tables. A call of the clock runs a command."""
     registry = "imud.contracts.registry:Registry"
-    ledger = [2, "object", "imud.model.ledger:Ledger", {}]
     rows = [4, "dict", [["bad", "os:system"], ["measure", "os:getpid"]]]
     plugins = [14, "tuple", [[15, "dict", []], [16, "dict", []]]]
     parts = {"rows": rows, "kind": "x", "_group": None, "_modules": [5, "dict", []], "_plugins": plugins}
-    decoder_parts = {"stale": 0, "_ledger": ["x", "ledger"], "_size_bytes": len(command), "_last": b"", "x": ledger}
+    decoder_parts = {"stale": 0, "_ledger": ["x", "ledger"], "_size_bytes": len(command), "_last": b""}
     decoder = [6, "object", "imud.drivers.polled_frames:PolledFrameDecoder", decoder_parts]
     imports = [3, "object", registry, parts]
     restart = [7, "partial", ["b", decoder, "decode"], [8, "tuple", [command]], imports]
