@@ -4,6 +4,7 @@ import argparse
 import logging
 import os
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
@@ -11,10 +12,11 @@ from typing import Final
 from imud import config
 from imud.cli.arguments import CliCommand
 from imud.cli.output import complain
+from imud.config import host_values
+from imud.config.host_values import Host
 from imud.config.model import Config, DeviceConfig
-from imud.config.yaml import FILE_BYTES_MAX
+from imud.config.yaml import FILE_BYTES_MAX, path_text, read_yaml
 from imud.contracts.lines import DeviceLines
-from imud.contracts.link import HostProblem
 from imud.contracts.setting import declared_values
 from imud.daemon import Daemon
 from imud.drivers import DRIVERS
@@ -22,10 +24,8 @@ from imud.fleet.settings import EVERY
 from imud.host import event_loop
 from imud.host.log import STDERR, is_journal, log_to
 from imud.host.process_end import STOP_LIMIT_S, EndDeadline
-from imud.links import LINKS
 from imud.model.errors import ConfigError, ImudError, ServerError
 from imud.model.options import unknown_name
-from imud.publishers import PUBLISHERS
 from imud.publishers.rules.settings import RulesOptions
 from imud.publishers.shm import ShmOptions, directory_problem
 
@@ -87,11 +87,14 @@ def check_arguments(parser: argparse.ArgumentParser) -> None:
 
 def check(args: argparse.Namespace) -> int:
     """Print one line if the file is valid, and notes. Return 1 if a driver or output of another package has a problem,
-    otherwise 0. Raises ConfigError with line and column if the file is invalid."""
-    settings = config.parse(standard_input(), "standard input") if args.file == "-" else config.load(args.file)
-    problems = list(unfit_values(settings))
-    if errors := [f"{args.file}: {place}: {problem.message}" for place, problem in problems if problem.is_error]:
-        raise ConfigError("\n".join(errors))
+    otherwise 0. Raises ConfigError with line and column if the file is invalid or does not fit the host."""
+    is_standard_input = args.file == "-"
+    content = standard_input() if is_standard_input else config.content_of(args.file)
+    filename = "standard input" if is_standard_input else args.file
+    settings = config.parse(content, filename)
+    errors, host_notes = host_problems(settings, content, filename)
+    if errors:
+        raise ConfigError("\n".join((*errors, *host_notes)))
     names = ", ".join(device.name for device in settings.devices) or "none"
     print(f"{args.file}: valid; devices: {names}")
     for device in settings.devices:
@@ -99,22 +102,27 @@ def check(args: argparse.Namespace) -> int:
             print(f"{args.file}:{device.line}: note: {device.name}: {note}")
     for note in (*unknown_devices(settings), *rules_without_values(settings), *missing_directories(settings)):
         print(f"{args.file}: note: {note}")
-    for place, host_problem in problems:
-        print(f"{args.file}: note: {place}: {host_problem.message}")
+    for note in host_notes:
+        print(note)
     for problem in settings.ignored:
         complain(problem)
     return 1 if settings.ignored else 0
 
 
-def unfit_values(settings: Config) -> Iterator[tuple[str, HostProblem]]:
-    """Yield the key and the problem of each value that does not fit this host."""
-    for device in settings.devices:
-        for problem in LINKS[device.link].host_problems(device.link_settings):
-            yield f"devices.{device.name}.{device.link}.{problem.key}", problem
-    for name, options in settings.publishers.items():
-        if name in PUBLISHERS and PUBLISHERS[name].wanted(options):
-            for problem in PUBLISHERS[name].host_problems(options):
-                yield f"{name}.{problem.key}", problem
+def host_problems(settings: Config, content: bytes, filename: str) -> tuple[list[str], list[str]]:
+    """Return the values of a configuration that do not fit this host: errors and notes, each with its line."""
+    tree = read_yaml(content)
+    errors: list[str] = []
+    notes: list[str] = []
+    for finding in host_values.findings(settings, Host(time.time())):
+        mark = tree.mark(finding.path)
+        place = f"{filename}:{mark.line}:{mark.column}:"
+        text = f"{path_text(finding.path)}: {finding.message}"
+        if finding.is_error:
+            errors.append(f"{place} {text}")
+        else:
+            notes.append(f"{place} note: {text}")
+    return errors, notes
 
 
 def unknown_devices(settings: Config) -> Iterator[str]:

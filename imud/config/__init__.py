@@ -15,7 +15,7 @@ reports all problems together.
 """
 
 from imud.config.model import Config, DeviceConfig, Differences, differences
-from imud.config.reading import DEVICE_NAME, DEVICES_MAX, PROBLEMS_SHOWN, load, load_options, parse
+from imud.config.reading import DEVICE_NAME, DEVICES_MAX, PROBLEMS_SHOWN, content_of, load, load_options, parse
 from imud.config.schema import TABLES, DeviceGeneral, General, Tables
 
 __all__ = [
@@ -29,6 +29,7 @@ __all__ = [
     "Differences",
     "General",
     "Tables",
+    "content_of",
     "differences",
     "load",
     "load_options",

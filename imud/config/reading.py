@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from ipaddress import IPv4Address, IPv6Address, ip_address
 from itertools import chain, islice
 from pathlib import Path
 from re import compile as pattern
@@ -27,6 +28,7 @@ from imud.contracts.condition import ConditionLimits
 from imud.contracts.driver import CanDriver, Driver, PolledDriver
 from imud.contracts.lines import DeviceLines
 from imud.contracts.link import CanUse, Claim, LinkType, conflict_of
+from imud.contracts.publisher import OutputListener, PublisherType
 from imud.contracts.registry import problems_of
 from imud.contracts.setting import SettingsTable, declared_values
 from imud.contracts.status import Deviations
@@ -51,12 +53,12 @@ def load(
     imud calls `pause` after each piece of work of less than a millisecond. `missing` is the hint if the file does not
     exist.
     """
-    return parse(_content(path, missing), str(path), tables, pause)
+    return parse(content_of(path, missing), str(path), tables, pause)
 
 
 def load_options(path: Path | str, schema: type[S]) -> S:
     """Read a YAML file that contains only the keys of `schema`. Raises ConfigError with all problems, one per line."""
-    tree = read_yaml(_content(path, MISSING))
+    tree = read_yaml(content_of(path))
     keys = Keys(tree)
     options = keys.part(schema, tree.data, ()) if tree.complete else None
     problems = [*tree.problems, *keys.problems_besides(tree.problems)]
@@ -65,7 +67,8 @@ def load_options(path: Path | str, schema: type[S]) -> S:
     return options
 
 
-def _content(path: Path | str, missing: str) -> bytes:
+def content_of(path: Path | str, missing: str = MISSING) -> bytes:
+    """Return the content of a configuration file, at most one byte above the limit. Raises ConfigError."""
     try:
         return read_regular(path, FILE_BYTES_MAX + 1)
     except OSError as error:
@@ -99,6 +102,8 @@ def _config(keys: Keys, tables: Tables, pause: Callable[[], None]) -> Config | N
         for path, message in tables.publishers[name].check(options, tables.drivers).items() if options else ():
             keys.problem((name, *path), message)
     outputs = {name: options for name, options in publishers.items() if options is not None}
+    for clash in listener_clashes(outputs, tables.publishers):
+        keys.problem(*clash)
     devices = DeviceReader(keys, tables, pause, outputs).devices(top)
     if general is None or devices is None or keys.problems:
         return None
@@ -173,6 +178,36 @@ def clashes(
                 if conflict := conflict_of(claim, other.claim, other.owner):
                     yield Clash((output, conflict.key), conflict.message)
                     break
+
+
+def listener_clashes(outputs: Mapping[str, Options], rows: Mapping[str, PublisherType]) -> Iterator[Clash]:
+    """Return the conflicts of the enabled outputs that listen on one TCP port of overlapping addresses."""
+    previous: list[tuple[str, OutputListener]] = []
+    for name, options in outputs.items():
+        for listener in rows[name].listeners(options) if rows[name].wanted(options) else ():
+            for other, other_listener in previous:
+                if _share_port(listener, other_listener):
+                    key = ".".join((other, *other_listener.path))
+                    message = f"expected a TCP port that no other output uses, got {listener.port}, the value of {key}"
+                    yield Clash((name, *listener.path), f"{message}; try {listener.port + 1}")
+                    break
+            previous.append((name, listener))
+
+
+def _share_port(listener: OutputListener, other: OutputListener) -> bool:
+    """Return whether the kernel refuses the second of these listeners. Port 0 is any free port."""
+    return listener.port == other.port != 0 and _overlap(_listen_ip(listener.address), _listen_ip(other.address))
+
+
+def _listen_ip(address: str) -> IPv4Address | IPv6Address:
+    ip = ip_address("127.0.0.1" if address == "localhost" else address)
+    return getattr(ip, "ipv4_mapped", None) or ip
+
+
+def _overlap(ip: IPv4Address | IPv6Address, other: IPv4Address | IPv6Address) -> bool:
+    """Return whether a connection can match both addresses. `::` also receives IPv4 (ipv6(7), IPV6_V6ONLY is 0)."""
+    wildcards = [address for address in (ip, other) if address.is_unspecified]
+    return ip == other or any(wildcard.version == 6 or ip.version == other.version for wildcard in wildcards)
 
 
 def owner_of(device: DeviceConfig, others: Sequence[DeviceConfig], links: Mapping[str, LinkType[Any]]) -> str:

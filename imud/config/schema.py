@@ -21,6 +21,7 @@ from imud.contracts.registry import problems_of
 from imud.contracts.setting import OnDifference
 from imud.drivers import DRIVERS
 from imud.links import LINKS
+from imud.model.host_object import Directory
 from imud.model.options import Options, disagreements, expected, got, unknown_name, value_problem
 from imud.publishers import PUBLISHERS
 
@@ -30,7 +31,7 @@ class General(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     """Lowest level of log messages."""
-    state_dir: Annotated[str, msgspec.Meta(min_length=1)] = "/var/lib/imud"
+    state_dir: Directory = "/var/lib/imud"
     """Directory of the state: found devices, flash writes, backups of device settings. imud creates it. A change needs
     a restart. STATE_DIRECTORY of systemd overrides this key."""
 

@@ -16,6 +16,7 @@ from msgspec.structs import fields
 
 from imud.host.threads import BusThread, StartWorker
 from imud.model.errors import LinkError
+from imud.model.host_object import HostObject, OptionalSocket, names
 from imud.model.options import Options
 
 RESET_VERB: Final = "reset"  # command of a device with the line `reset`
@@ -103,7 +104,7 @@ class LineOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True
 
     line: Annotated[int, Meta(ge=0, le=1023)] | Annotated[str, Meta(min_length=1, max_length=31)]
     """Number of the line on its chip, or its name, for example `GPIO17`."""
-    chip: Annotated[str, Meta(max_length=64)] = ""
+    chip: Annotated[str, Meta(max_length=64, extra=names(HostObject.GPIO_CHIP))] = ""
     """`/dev/gpiochip0`, `gpiochip0`, or the label of the chip; empty: imud searches all chips for the
     name of the line."""
     active_low: bool = False
@@ -147,7 +148,7 @@ class DividedOptions(InputOptions, frozen=True, kw_only=True, forbid_unknown_fie
 class PpsOptions(InputOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of the pulse per second."""
 
-    chrony: str = ""
+    chrony: OptionalSocket = ""
     """Socket of chronyd that receives the pulses, for example `/run/chrony.imud.sock`; empty: none. Without `rmc`,
     chronyd needs another source for the second."""
     chrony_sample_bytes: Literal[32, 40] | None = None

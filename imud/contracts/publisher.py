@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
 from socket import socket
-from typing import Any, ClassVar, Final, Protocol, cast
+from typing import Any, ClassVar, Final, NamedTuple, Protocol, cast
 
 from imud.attitude.conventions import Convention
 from imud.attitude.published import PublishedAxes, as_sent
@@ -377,6 +377,14 @@ class PublisherContext:
     kept: dict[str, Any] = field(default_factory=dict)  # data that a restarted output continues with, by name
 
 
+class OutputListener(NamedTuple):
+    """TCP address and port on which an output listens."""
+
+    path: tuple[str, ...]  # key of the port, below the key of the output
+    address: str  # IP address, or localhost
+    port: int  # 0: any free port
+
+
 def _claims_nothing(_settings: Options) -> Sequence[Claim]:
     return ()
 
@@ -404,4 +412,6 @@ class PublisherType:
     check: Callable[[Any, Mapping[str, Driver]], Mapping[tuple[str, ...], str]] = lambda _options, _drivers: {}
     # Returns the values of these options that do not fit this host. It opens nothing.
     host_problems: Callable[[Any], Iterable[HostProblem]] = lambda _options: ()
+    # Returns the addresses on which these options listen. No other output can use them.
+    listeners: Callable[[Any], Sequence[OutputListener]] = lambda _options: ()
     interface: int = 0  # interface version for which another package was written; 0 for outputs of imud

@@ -268,6 +268,8 @@ def _tls_context(access: BrokerAccess) -> "ssl.SSLContext":
     """Return the TLS configuration of a client. Raises ValueError with the key and the path."""
     import ssl
 
+    from imud.host.certificates import EncryptedKey, load_client_certificate
+
     ca, cert, key = access.ca_file, access.cert_file, access.key_file
     for name, path in (("ca_file", ca), ("cert_file", cert), ("key_file", key)):
         if path is not None:
@@ -276,19 +278,15 @@ def _tls_context(access: BrokerAccess) -> "ssl.SSLContext":
         context = tls_context(ca)
     except ssl.SSLError as error:
         raise ValueError(f"ca_file {ca}: expected certificates (PEM), got no valid certificate") from error
-    try:
-        if cert is not None:
-            context.load_cert_chain(cert, key, _no_passphrase)
-    except ssl.SSLError as error:
-        words = f"cert_file {cert}" if key is None else f"cert_file {cert}, key_file {key}"
-        problem = f": {error.reason}" if error.reason else ""
-        raise ValueError(f"{words}: expected a certificate and its key (PEM){problem}") from error
+    if cert is not None:
+        try:
+            load_client_certificate(context, cert, key)
+        except EncryptedKey:
+            raise ValueError("key_file: expected a key without a passphrase, got an encrypted key") from None
+        except ValueError as error:
+            place = f"cert_file {cert}" if key is None else f"cert_file {cert}, key_file {key}"
+            raise ValueError(f"{place}: expected a certificate and its key (PEM), got: {error}") from error
     return context
-
-
-def _no_passphrase() -> str:
-    # without this function, OpenSSL would request the passphrase on the terminal and wait
-    raise ValueError("key_file: expected a key without a passphrase, got an encrypted key")
 
 
 def _read(name: str, path: str, most: int) -> bytes:

@@ -11,6 +11,7 @@ import msgspec
 from imud.contracts.driver import Driver
 from imud.contracts.lines import LINE_VERBS
 from imud.contracts.publisher import PublisherType, make_later
+from imud.model.host_object import CaFile, CertificateFile, Directory, KeyFile, SecretFile
 from imud.model.options import Options, is_host, shown, unknown_name
 from imud.model.units import NS_PER_S
 
@@ -157,13 +158,13 @@ class MqttOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True
     first dot."""
     user: str = ""
     """User name for the broker; empty: none."""
-    password_file: str | None = None
+    password_file: SecretFile | None = None
     """File with the password in its first line, read at each connection; null: no password."""
-    ca_file: str | None = None
+    ca_file: CaFile | None = None
     """CA certificates (PEM) for the broker; null: the certificates that the system trusts."""
-    cert_file: str | None = None
+    cert_file: CertificateFile | None = None
     """Client certificate (PEM) of this gateway; null: no certificate."""
-    key_file: str | None = None
+    key_file: KeyFile | None = None
     """Key of the certificate (PEM, without a passphrase); null if `cert_file` contains the key."""
     keep_alive_s: Annotated[int, msgspec.Meta(ge=5, le=3600)] = 30
     """Keep-alive time, s. imud detects a dead connection within twice this time."""
@@ -173,7 +174,7 @@ class MqttOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True
     """Maximum number of stream messages per second, above the rate of new messages; null: no limit."""
     newest_first: bool = False
     """Send new messages before older messages. Streams are then not in order."""
-    spool_directory: Annotated[str, msgspec.Meta(min_length=1)] = "/var/lib/imud/mqtt"
+    spool_directory: Directory = "/var/lib/imud/mqtt"
     """Directory of the spool. imud creates it."""
     spool_mb: Annotated[float, msgspec.Meta(ge=1, le=1_000_000)] = 256.0
     """Maximum size of the spool, MB (10⁶ bytes). If it is full, imud first replaces the oldest samples by statistics,

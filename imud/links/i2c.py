@@ -19,6 +19,7 @@ from imud.contracts.status import KernelCounters
 from imud.host.library_call import LibraryCall
 from imud.links.device_node import DeviceNode, bus_open_problem, transfer_problem
 from imud.model.errors import LinkError
+from imud.model.host_object import HostObject, names
 from imud.model.options import Options
 
 I2C_TIMEOUT: Final = 0x0702  # ioctl: timeout of the adapter in units of 10 ms (<linux/i2c-dev.h>)
@@ -30,7 +31,7 @@ BLOCK_BYTES_MAX: Final = 32  # maximum length of an I2C block read of an SMBus c
 class I2cOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of an I2C bus."""
 
-    bus: Annotated[int, Meta(ge=0, le=255)] = 1
+    bus: Annotated[int, Meta(ge=0, le=255, extra=names(HostObject.I2C_BUS))] = 1
     """Number of the bus: 1 for `/dev/i2c-1`."""
     address: Annotated[int, Meta(ge=0x08, le=0x77)] | Literal["auto"] = "auto"
     """7-bit address, for example 0x18. `auto`: imud tries each address that the device supports."""

@@ -44,6 +44,7 @@ from imud.formats.modbus import (
 from imud.links.device_node import CABLE, PROC, DeviceNode
 from imud.links.serial_port import TtyCounters, hold_ns, open_port, port_problem, request_low_latency
 from imud.model.errors import LinkError, LinkMissing, TransferError, Trouble
+from imud.model.host_object import SerialPort
 from imud.model.options import Options, shown
 from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
 
@@ -410,7 +411,7 @@ SHARED_PORTS: Final = SharedPorts()  # open buses of this process
 class Rs485Options(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of a device on an RS-485 bus. `address`, `rate_hz` and `reply_ms` can differ on the same bus."""
 
-    line: Annotated[str, Meta(min_length=1)]
+    line: SerialPort
     """Path of the port. Several devices can have the same path."""
     baud: Annotated[int, Meta(ge=300, le=4_000_000)] = 115200
     """Baud rate of the bus, bit/s."""

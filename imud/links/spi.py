@@ -23,6 +23,7 @@ from imud.contracts.script import Transfer
 from imud.contracts.status import KernelCounters
 from imud.links.device_node import DeviceNode, bus_open_problem, transfer_problem
 from imud.model.errors import LinkError
+from imud.model.host_object import SpiPort
 from imud.model.options import Options
 
 WR_MODE: Final = 0x40016B01  # ioctl _IOW('k', 1, __u8): set the SPI mode
@@ -44,7 +45,7 @@ Ioctl = Callable[[int, int, bytes], object]
 class SpiOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of an SPI bus."""
 
-    port: Annotated[str, Meta(min_length=1)]
+    port: SpiPort
     """Path of bus and chip select, for example `/dev/spidev0.0`."""
     speed_hz: Annotated[int, Meta(ge=200_000, le=2_000_000)] = 1_000_000
     """Clock of the bus, Hz."""

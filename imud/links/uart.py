@@ -19,6 +19,7 @@ from imud.contracts.status import KernelCounters
 from imud.links.device_node import CABLE, PROC, DeviceNode
 from imud.links.serial_port import TtyCounters, change_baud, hold_ns, open_port, port_problem, request_low_latency
 from imud.model.errors import LinkError, LinkMissing
+from imud.model.host_object import SerialPort
 from imud.model.options import Options
 
 READ_BYTES: Final = 65536
@@ -35,7 +36,7 @@ DEFAULT_BAUD: Final = 115200  # baud rate of a port that imud opens for detectio
 class UartOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of a serial port."""
 
-    port: Annotated[str, Meta(min_length=1)]
+    port: SerialPort
     """Path of the port. `/dev/serial/by-id/…` names the adapter and survives replugging; `/dev/ttyUSB0` does not."""
     baud: Annotated[int, Meta(ge=50, le=4_000_000)] | Literal["auto"] = "auto"
     """Baud rate, bit/s. `auto`: imud tries each rate of the device."""

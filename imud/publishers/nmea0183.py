@@ -16,10 +16,11 @@ from typing import Annotated, Final, Literal
 import msgspec
 
 from imud.contracts.link import Claim
-from imud.contracts.publisher import Batch, PublisherContext, PublisherType
+from imud.contracts.publisher import Batch, OutputListener, PublisherContext, PublisherType
 from imud.contracts.status import OutputStatus
 from imud.formats import nmea0183
 from imud.formats.nmea0183 import Transducer
+from imud.model.host_object import ListenAddress, SerialPort
 from imud.model.options import Options, is_ip_address, shown
 from imud.model.sample import Sample
 from imud.model.units import NS_PER_S
@@ -153,14 +154,14 @@ class Nmea0183Options(Options, frozen=True, kw_only=True, forbid_unknown_fields=
     """Sentences and their rates, Hz. imud sends only the listed sentences."""
     talker: Talker = ""
     """Talker of all sentences; empty: HC for headings, TI for ROT, YX for XDR."""
-    tcp_address: Annotated[str, msgspec.Meta(min_length=1)] = "127.0.0.1"
+    tcp_address: ListenAddress = "127.0.0.1"
     """IP address of the TCP server; `0.0.0.0`: all networks of the host. There is no password."""
     tcp_port: Annotated[int, msgspec.Meta(ge=0, le=65535)] | None = 10110
     """TCP port; 0: any free port, null: no TCP server."""
     udp: list[str] = msgspec.field(default_factory=list)
     """Destinations of UDP datagrams, each as ADDRESS:PORT: a host, a multicast group, or a broadcast address such as
     `192.168.1.255:10110`."""
-    serial_port: str | None = None
+    serial_port: SerialPort | None = None
     """Serial port for the sentences; null: no serial port."""
     serial_baud: Annotated[int, msgspec.Meta(ge=4800, le=921600)] = 38400
     """Baud rate of the serial port, bit/s. The standard specifies 4800 and 38400."""
@@ -288,4 +289,8 @@ def _claims(settings: Nmea0183Options) -> list[Claim]:
     return [] if used is None else [Claim(place=used, key="serial_port")]
 
 
-PUBLISHER = PublisherType("nmea0183", Nmea0183Options, Nmea0183, claims=_claims)
+def _listeners(options: Nmea0183Options) -> list[OutputListener]:
+    return [] if options.tcp_port is None else [OutputListener(("tcp_port",), options.tcp_address, options.tcp_port)]
+
+
+PUBLISHER = PublisherType("nmea0183", Nmea0183Options, Nmea0183, claims=_claims, listeners=_listeners)

@@ -50,6 +50,7 @@ from imud.formats.ring import (
 from imud.formats.slot import SEQ_INVALID, SLOT_BYTES, slot_seqs, slots_in
 from imud.host.files import READ_FLAGS, can_replace, user_name
 from imud.model.errors import ServerError
+from imud.model.host_object import GroupName, MemoryDirectory
 from imud.model.options import Options
 from imud.model.units import NS_PER_MS
 
@@ -450,13 +451,13 @@ class ShmOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     enabled: bool = True
     """Write rings."""
-    directory: str = DIRECTORY
+    directory: MemoryDirectory = DIRECTORY
     """Directory of the ring files. If the default is not usable, imud uses $XDG_RUNTIME_DIR/imud/shm."""
     slots: Annotated[int, msgspec.Meta(ge=SLOTS_MIN, le=SLOTS_MAX)] = 4096
     """Number of samples in a ring, a power of two: 4096 are four seconds at 1 kHz and 1.3 MB per device."""
     latency_ms: Annotated[float, msgspec.Meta(ge=0, le=50)] = 5.0
     """Maximum hold of samples, ms; 0: imud writes each sample immediately (docs/latency.md)."""
-    group: str = "imud"
+    group: GroupName = "imud"
     """Group with read access, if it exists and imud may use it."""
     mode: Annotated[int, msgspec.Meta(ge=0, le=0o777)] = 0o640
     """File mode: permissions of owner, group and others. Only the owner may have write permission."""

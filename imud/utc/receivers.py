@@ -19,6 +19,7 @@ from imud.contracts.link import StreamLink
 from imud.formats.nmea0183 import RMC_BYTES_MAX
 from imud.host.peer_stream import READ_BYTES, TICK_S, PeerStream, open_peer_stream
 from imud.model.errors import LinkError, reason_of
+from imud.model.host_object import OptionalSerialPort
 from imud.model.options import Options, is_host, shown
 from imud.model.work_budget import WorkBudget, WorkLimits
 
@@ -42,7 +43,7 @@ class RmcOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """TCP port of gpsd."""
     gps: Annotated[str, Meta(max_length=256)] = ""
     """Path of the receiver in gpsd, if gpsd has several receivers. Empty for all receivers."""
-    port: str = ""
+    port: OptionalSerialPort = ""
     """Path of the receiver's serial port, for `nmea`."""
     baud: Annotated[int, Meta(ge=4800, le=921_600)] = 9600
     """Baud rate of this port, bit/s."""

@@ -26,6 +26,7 @@ from imud.config.yaml import read_yaml
 from imud.contracts.driver import KeyProblem
 from imud.contracts.lines import LINE_SCHEMAS, DeviceLines
 from imud.contracts.link import Claim
+from imud.contracts.publisher import OutputListener
 from imud.contracts.setting import SettingsTable
 from imud.drivers import DRIVERS
 from imud.drivers.imu61x.uart.commands import Imu61xUartOptions
@@ -87,6 +88,8 @@ class FakeRow:
         return self.faults
 
     claims: Callable[[Any], Sequence[Claim]] = lambda _settings: ()
+    listeners: Callable[[Any], Sequence[OutputListener]] = lambda _settings: ()
+    wanted: Callable[[Any], bool] = lambda _settings: True
     used_lines: Callable[[Any], Sequence[Any]] = lambda _settings: ()
     problem: Callable[[Any, bool], str] = lambda _settings, _frames: ""
     check: Callable[[Any, Any], Mapping[tuple[str, ...], str]] = lambda _settings, _drivers: {}

@@ -11,6 +11,7 @@ import msgspec
 from imud.contracts.driver import Driver
 from imud.contracts.publisher import PublisherType, make_later
 from imud.host.http_post import post_url
+from imud.model.host_object import CaFile, OutputUrl, SecretFile
 from imud.model.options import Options, is_ip_address, shown
 
 MEGABYTE: Final = 1_000_000
@@ -45,10 +46,10 @@ def _is_destination(url: str) -> bool:
 class DestinationOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of one destination."""
 
-    token_file: str | None = None
+    token_file: SecretFile | None = None
     """HTTP: file with an InfluxDB token, or with a value of the header Authorization such as `Bearer TOKEN`, in its
     first line; null: none."""
-    ca_file: str | None = None
+    ca_file: CaFile | None = None
     """HTTPS: CA certificates (PEM) of the server; null: the certificates that the system trusts."""
     gzip: bool = False
     """HTTP: compress requests. VictoriaMetrics, InfluxDB and Telegraf accept it."""
@@ -63,7 +64,7 @@ class InfluxOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     enabled: bool = False
     """Send line protocol."""
-    to: dict[str, DestinationOptions] = msgspec.field(default_factory=dict)
+    to: dict[OutputUrl, DestinationOptions] = msgspec.field(default_factory=dict)
     """Destinations by URL: `file:///PATH`, `udp://ADDRESS:PORT`, `tcp://ADDRESS:PORT`, or the write URL of a server
     (`http`, `https`)."""
     devices: list[str] | None = None

@@ -26,11 +26,12 @@ from prometheus_client.core import Metric
 from prometheus_client.registry import Collector
 from prometheus_client.samples import Sample as Line
 
-from imud.contracts.publisher import PublisherContext, PublisherType
+from imud.contracts.publisher import OutputListener, PublisherContext, PublisherType
 from imud.contracts.status import ClientStatus, DeviceStatus
 from imud.host.log import messages_dropped
 from imud.host.scrape_server import HttpRequest, HttpResponse, ScrapeServer, encoder_for
 from imud.model.event import Event
+from imud.model.host_object import ListenAddress
 from imud.model.options import Options, is_ip_address, shown
 from imud.model.units import NS_PER_S
 from imud.model.work_budget import WorkBudget, WorkLimits
@@ -69,7 +70,7 @@ class MetricsOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     enabled: bool = True
     """Serve metrics."""
-    address: Annotated[str, msgspec.Meta(min_length=1)] = "127.0.0.1"
+    address: ListenAddress = "127.0.0.1"
     """IP address of the server; `0.0.0.0`: all networks of the host. There is no password."""
     port: Annotated[int, msgspec.Meta(ge=0, le=65535)] = 9321
     """TCP port; 0: any free port."""
@@ -326,4 +327,8 @@ class MetricsPublisher:
             )
 
 
-PUBLISHER = PublisherType("metrics", MetricsOptions, MetricsPublisher)
+def _listeners(options: MetricsOptions) -> list[OutputListener]:
+    return [OutputListener(("port",), options.address, options.port)]
+
+
+PUBLISHER = PublisherType("metrics", MetricsOptions, MetricsPublisher, listeners=_listeners)

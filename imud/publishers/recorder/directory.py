@@ -17,6 +17,7 @@ import msgspec
 
 from imud.contracts.lines import InputOptions
 from imud.host.files import can_replace, read_regular, replace_file
+from imud.model.host_object import Directory, OptionalDirectory
 from imud.model.options import Options
 from imud.model.units import NS_PER_S
 
@@ -208,7 +209,7 @@ class FlightOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Time after an alert, s."""
     memory_mb: Annotated[float, msgspec.Meta(ge=1, le=100_000)] = 64.0
     """Maximum size of the kept data, MB (10⁶ bytes). imud keeps fewer minutes if they need more."""
-    directory: str = ""
+    directory: OptionalDirectory = ""
     """Directory of the kept data, for example on a tmpfs; empty: main memory. After a kill, imud saves the data of this
     directory at the next start."""
     acceleration_m_s2: Annotated[float, msgspec.Meta(gt=0, le=1_000_000)] | None = None
@@ -226,7 +227,7 @@ class RecorderOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=
 
     enabled: bool = False
     """Record continuously."""
-    directory: Annotated[str, msgspec.Meta(min_length=1)] = "/var/lib/imud/recordings"
+    directory: Directory = "/var/lib/imud/recordings"
     """Directory of the recordings. imud creates it."""
     devices: list[str] | None = None
     """Names of the recorded devices; null: all devices."""

@@ -5,6 +5,7 @@ from typing import Annotated, Final
 import msgspec
 
 from imud.contracts.publisher import PublisherType, make_later
+from imud.model.host_object import InterfaceAddress
 from imud.model.options import Options, is_ip_address, shown
 
 # Ports (RTPS 2.2, section 9.6.1): PORT_BASE + PORT_STEP * domain for multicast
@@ -31,7 +32,7 @@ class Ros2Options(Options, frozen=True, kw_only=True, forbid_unknown_fields=True
     """Domain of the robot (ROS_DOMAIN_ID)."""
     node: NodeName = "imud"
     """Name of the node. Give each gateway of a domain its own name."""
-    address: str | None = None
+    address: InterfaceAddress | None = None
     """IPv4 address of the network interface; null: all interfaces, 127.0.0.1: this host only. There is no password."""
     devices: dict[str, Ros2Sending] = msgspec.field(default_factory=lambda: {EVERY: Ros2Sending()})
     """Options of each device; `*`: of all devices without an entry of their own."""

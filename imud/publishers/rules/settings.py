@@ -9,6 +9,7 @@ import msgspec
 
 from imud.contracts.lines import LineOptions, OutputOptions
 from imud.contracts.publisher import PublisherType, make_later
+from imud.model.host_object import Command
 from imud.model.options import Options, shown
 
 RULES_MAX: Final = 64  # maximum number of rules: each costs time for each sample of its devices
@@ -79,9 +80,9 @@ class RuleOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=True
     """Save a snapshot of the flight recorder when the rule begins."""
     line: OutputOptions | None = None
     """GPIO line that is active while the rule is active for a device; null: no line."""
-    command: Annotated[list[str], msgspec.Meta(max_length=64)] = msgspec.field(default_factory=list[str])
+    command: Command = msgspec.field(default_factory=list[str])
     """Program with an absolute path, and its arguments, that imud runs when the rule begins; empty: none."""
-    end_command: Annotated[list[str], msgspec.Meta(max_length=64)] = msgspec.field(default_factory=list[str])
+    end_command: Command = msgspec.field(default_factory=list[str])
     """Program and arguments that imud runs when the rule ends; empty: none."""
 
     def __post_init__(self) -> None:

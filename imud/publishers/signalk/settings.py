@@ -6,6 +6,7 @@ from urllib.parse import urlsplit
 import msgspec
 
 from imud.contracts.publisher import PublisherType, make_later
+from imud.model.host_object import CaFile
 from imud.model.options import Options, is_host, shown
 
 WHO: Final = "signalk"  # name of this output
@@ -49,7 +50,7 @@ class SignalKOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Name of the device; null: the only device of the configuration."""
     url: str = "http://127.0.0.1:3000"
     """Server: `http://HOST:PORT`, or `https://HOST:PORT` (TLS)."""
-    ca_file: str | None = None
+    ca_file: CaFile | None = None
     """CA certificates (PEM) for `https`, or a copy of the server's own certificate; null: the certificates that the
     system trusts."""
     rate_hz: RateHz = 10.0

@@ -26,6 +26,7 @@ from imud.contracts.publisher import PublisherContext, PublisherType
 from imud.formats import kernel
 from imud.formats.jsonrpc import DEFAULT_PATH, PROTOCOL, Code, RpcError, encode_error, encode_notification, line_of
 from imud.model.errors import ServerError, reason_of
+from imud.model.host_object import GroupName, HostObject, names
 from imud.model.options import Options, shown
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.publishers.socket.admission import (
@@ -81,7 +82,7 @@ class Listener:
     # renames, the first sees after its rename that its file was replaced. A window of two system calls remains: if the
     # second renames after the last check of the first, the first serves a socket that no client finds.
 
-    def __init__(self, path: Path, group: str, control_group: str = "") -> None:
+    def __init__(self, path: Path, group: str, control_group: GroupName = "") -> None:
         self.path = path
         _check_length(path)
         _make_directory(path.parent)
@@ -263,11 +264,14 @@ class SocketOptions(Options, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     enabled: bool = True
     """Whether imud serves the socket."""
-    path: Annotated[str, msgspec.Meta(pattern="^/.*[^/]$", extra={"words": "an absolute path"})] = DEFAULT_PATH
+    path: Annotated[
+        str,
+        msgspec.Meta(pattern="^/.*[^/]$", extra={"words": "an absolute path"} | names(HostObject.SERVER_SOCKET)),
+    ] = DEFAULT_PATH
     """Absolute path of the socket."""
-    group: str = "imud"
+    group: GroupName = "imud"
     """Group that may read. The socket file belongs to it."""
-    control_group: str = "imud-control"
+    control_group: GroupName = "imud-control"
     """Group that may also control devices: commands, settings, calibrations, recordings."""
     clients_max: Annotated[int, msgspec.Meta(ge=1, le=4096)] = 256
     """Maximum number of clients. imud refuses more clients with an error."""
