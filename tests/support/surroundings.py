@@ -18,6 +18,7 @@ from typing import Final
 import pytest
 
 from imud.cli.doctor.surroundings import CommandOutput, DaemonReply, DoctorCheck, DoctorFinding, Surroundings
+from imud.config.host_values import HostFinding
 from imud.contracts.status import CKernelStatus, DeviceStatus
 from imud.model.errors import LinkMissing
 from imud.utc.system_clock import KernelClock
@@ -115,6 +116,7 @@ class Machine:
         self.c_kernel: CKernelStatus | None = CKernelStatus(True)
         self.clock = KernelClock(True, 50, 1000)
         self.sync_s: list[float] = []  # times of the next writes
+        self.host_findings: list[HostFinding] = []
         self.uid = 1000
         self.gids: frozenset[int] = frozenset({1000})
         self.boot_utc_ns = 0
@@ -181,7 +183,7 @@ class Machine:
         return Surroundings(
             Path("/etc/imud.yaml"), self.ask, root=self.root, run=self.run, fetch=self.fetch,
             clock=lambda: self.clock, sync_s=lambda _folder: next(times_s), uid=self.uid, gids=self.gids,
-            boot_utc_ns=lambda: self.boot_utc_ns, pause=self.pause,
+            boot_utc_ns=lambda: self.boot_utc_ns, pause=self.pause, host_findings=lambda _config: self.host_findings,
         )  # fmt: skip
 
     def find(self, check: DoctorCheck) -> list[DoctorFinding]:

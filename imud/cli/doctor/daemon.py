@@ -8,8 +8,10 @@ from typing import Final
 import msgspec
 
 from imud.cli.doctor.surroundings import DoctorFinding, Findings, Surroundings, error, not_checked, note, ok, warning
+from imud.config.yaml import path_text
 from imud.contracts.condition import DOCTOR, Condition
 from imud.contracts.status import DeviceState, DeviceStatus
+from imud.host.files import open_regular
 from imud.model.errors import LinkDenied, reason_of
 from imud.model.units import NS_PER_S, NS_PER_US
 from imud.publishers.metrics.publisher import MetricsOptions, Scrapes
@@ -37,13 +39,17 @@ def configuration(at: Surroundings) -> Findings:
             yield warning(
                 f"{at.config_file} contains no device", "add a device; list the attached devices with `imud probe`"
             )
+        advice = f"run `imud check {at.config_file}`, which names the line, and correct the file"
+        for finding in at.host_findings(at.config):
+            if finding.is_error:  # a warning is often about a file that this user may not read
+                yield error(f"{at.config_file}: {path_text(finding.path)}: {finding.message}", advice)
         for name in at.config.disabled:
             yield note(f"device {name} is disabled in {at.config_file}")
         for problem in at.config.ignored:
             yield error(problem, "then restart imud: `sudo systemctl restart imud` (docs/drivers.md)")
         return
     try:
-        at.at(at.config_file).open("rb").close()
+        open_regular(at.at(at.config_file)).close()
     except OSError as problem:
         # not an error: other users usually cannot read the file
         if problem.errno in (errno.EACCES, errno.EPERM):

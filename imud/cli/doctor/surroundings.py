@@ -8,7 +8,7 @@ import os
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from enum import StrEnum
 from functools import cached_property
 from http.client import HTTPConnection, HTTPException
@@ -19,8 +19,11 @@ import msgspec
 
 from imud import config
 from imud.client.connection import Client
+from imud.config import host_values
+from imud.config.host_values import Host, HostFinding
 from imud.config.model import Config, DeviceConfig
 from imud.contracts.status import CKernelStatus, DeviceStatus
+from imud.host.files import read_regular
 from imud.model.errors import ConfigError, ImudError, LinkMissing
 from imud.model.units import NS_PER_S
 from imud.utc.system_clock import KernelClock, kernel_clock
@@ -57,6 +60,11 @@ class DaemonReply(NamedTuple):
     c_kernel: CKernelStatus | None = None  # None: the daemon is of an older version
 
 
+def host_findings_now(config: Config) -> Iterator[HostFinding]:
+    """Yield the values of a configuration that do not fit this host now."""
+    return host_values.findings(config, Host(time.time()))
+
+
 class Surroundings:
     """The host, or a simulated host of a test. Slow requests run once. Synchronization: one thread."""
 
@@ -74,11 +82,12 @@ class Surroundings:
         gids: frozenset[int] | None = None,
         boot_utc_ns: Callable[[], int] = lambda: time.time_ns() - time.monotonic_ns(),
         pause: Callable[[float], None] = time.sleep,
+        host_findings: Callable[[Config], Iterable[HostFinding]] | None = None,
     ) -> None:
         """`ask` returns the reply of the daemon; it raises ImudError or TimeoutError if the daemon does not reply.
 
         `sync_s` measures the time of a write to a folder, s. `boot_utc_ns` returns UTC when CLOCK_MONOTONIC was 0.
-        `pause` waits for a time in seconds.
+        `pause` waits for a time in seconds. `host_findings` returns the values that do not fit the host.
         """
         self.config_file = config_file
         self.root = root
@@ -90,6 +99,7 @@ class Surroundings:
         self.gids = frozenset({*os.getgroups(), os.getegid()}) if gids is None else gids
         self.boot_utc_ns = boot_utc_ns
         self.pause = pause
+        self.host_findings = host_findings or host_findings_now
         self._ask = ask
 
     # --- files --------------------------------------------------------------------------------------------------------
@@ -105,9 +115,8 @@ class Surroundings:
     def text(self, path: str | Path) -> str | None:
         """Return the content of a file without surrounding white space; None if imud cannot read the file."""
         try:
-            with self.at(path).open("rb") as file:
-                # texts of the device tree end with NUL
-                return file.read(TEXT_BYTES_MAX).decode("utf-8", "replace").strip(" \n\t\0")
+            # texts of the device tree end with NUL
+            return read_regular(self.at(path), TEXT_BYTES_MAX).decode("utf-8", "replace").strip(" \n\t\0")
         except OSError:
             return None
 

@@ -3,7 +3,6 @@
 import asyncio
 import errno
 import os
-from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -13,6 +12,7 @@ import pytest
 from imud.cli.doctor import daemon as checks
 from imud.cli.doctor.command import examine, exit_status
 from imud.cli.doctor.surroundings import DoctorCheck, fetch_over_http
+from imud.config.host_values import HostFinding
 from imud.contracts.status import CKernelStatus, DeviceState, DeviceStatus, KernelCounters, LinesStatus
 from imud.contracts.status import SerialLineCounters as Counters
 from imud.model.errors import LinkDenied, LinkMissing, ServerError
@@ -34,13 +34,24 @@ ACTIVE = ("ActiveState=active", "UnitFileState=enabled", "Result=success", "NRes
 def test_configurations_and_a_service_without_systemd_or_a_unit_or_with_a_fault(machine: Machine) -> None:
     machine.tells(CONFIGURATION, "error", "No such file", "`sudo imud setup`")
     for number in (errno.EACCES, errno.EPERM):
-        with mock.patch.object(Path, "open", side_effect=OSError(number, "denied")):
+        with mock.patch("imud.cli.doctor.daemon.open_regular", side_effect=OSError(number, "denied")):
             machine.tells(CONFIGURATION, "not checked", "this user cannot read /etc/imud.yaml", "`sudo imud doctor`")
     machine.configure(BOW, "old: {enabled: false, driver: hipnuc-uart, uart: {port: /dev/ttyUSB1, baud: 115200}}")
     assert machine.told(CONFIGURATION) == [
         ("ok", "/etc/imud.yaml is valid; devices: bow → "),
         ("note", "device old is disabled in /etc/imud.yaml → "),
     ]
+    machine.host_findings = [
+        HostFinding(("devices", "bow", "uart", "port"), "expected a serial port, got /dev/null", is_error=True),
+        HostFinding(("state_dir",), "expected an absolute path, got state", is_error=False),
+    ]
+    assert machine.told(CONFIGURATION)[1] == (
+        "error",
+        "/etc/imud.yaml: devices.bow.uart.port: expected a serial port, got /dev/null → run `imud check "
+        "/etc/imud.yaml`, which names the line, and correct the file",
+    )
+    assert len(machine.told(CONFIGURATION)) == 3
+    machine.host_findings = []
     machine.configure()
     assert [finding.severity for finding in machine.find(CONFIGURATION)] == ["warning"]
     machine.configure("bow: {driver: hipnuc-uart, uart: {prt: /dev/ttyUSB0}}")
@@ -67,6 +78,23 @@ def test_configurations_and_a_service_without_systemd_or_a_unit_or_with_a_fault(
         assert (got, words in text) == (severity, True), changed
     machine.unit("UnitFileState=enabled", "ActiveState=failed", "Result=exit-code", "ExecMainStatus=78")
     assert "with `imud check`" in machine.told(SERVICE)[-1][1]
+
+
+@pytest.mark.parametrize("kind", ["fifo", "directory", "device"])
+def test_configuration_that_is_not_a_regular_file(machine: Machine, kind: str) -> None:
+    """Opening a FIFO waited for its writer without output."""
+    path = machine.root / "etc" / "imud.yaml"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if kind == "fifo":
+        os.mkfifo(path)
+    elif kind == "directory":
+        path.mkdir()
+    else:
+        path.symlink_to("/dev/zero")
+    (finding,) = machine.told(CONFIGURATION)
+    assert finding[0] == "error"
+    assert "cannot read" in finding[1]
+    assert machine.surroundings().text("/etc/imud.yaml") is None
 
 
 def test_answers_of_the_socket_and_use_of_the_kernel_in_c(machine: Machine) -> None:
