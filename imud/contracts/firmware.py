@@ -143,8 +143,15 @@ def check_range(image: FirmwareImage, start: int | None, flash_bytes: int = IMAG
 
 
 def _same(one: str, other: str) -> bool:
-    """Return whether two names belong to one product: HI14R3 and HI14 do, HI14R3 and HI14R2 do not."""
-    one, other = one.upper(), other.upper()
+    """Return whether two names belong to one product: HI14R3 and HI14 do, HI14R3 and HI14R2 do not.
+
+    A suffix of the order code (HI14R3-URT-000) must be equal only if both names have one. The vendor's own programs
+    show the names HI14 and HI14R3 without a suffix, and their update compares no names.
+    """
+    one, _, suffix = one.upper().partition("-")
+    other, _, other_suffix = other.upper().partition("-")
+    if suffix and other_suffix and suffix != other_suffix:
+        return False
     begin, begin_other = _FAMILY.match(one), _FAMILY.match(other)
     if begin is None or begin_other is None:
         return one == other
