@@ -155,7 +155,10 @@ LONG_MODULES = {
     "imud.sampling.device_time": "the device time and the period that it learns",
     "imud.sampling.path": "the path of the samples, for streams, CAN and polled devices",
 }
-LONG_CLASSES = {"SampleClock": "one state machine with a fast path"}
+LONG_CLASSES = {
+    "DeviceSettings": "one state machine: what imud knows of the settings of a device",
+    "SampleClock": "one state machine with a fast path",
+}
 LARGE_CONSTRUCTORS = {
     "imud.cli.doctor.surroundings.Surroundings", "imud.cli.setup.steps.SetupSteps", "imud.sampling.clock.SampleClock",
     "imud.sampling.steering.Holdover", "imud.sim.can_module.PeriodicCanModule",

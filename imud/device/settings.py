@@ -39,7 +39,6 @@ from imud.device.flash import FlashValues, ModuleFlash, SettingsFiles, backup_te
 from imud.device.health import DeviceEvents
 from imud.device.settings_plan import (
     DEVICE_ERRORS,
-    Applying,
     SettingsPort,
     Values,
     advice,
@@ -52,6 +51,7 @@ from imud.device.settings_plan import (
     wanted_values,
     words,
 )
+from imud.device.settings_writes import Applying
 from imud.host.clock import HostClock
 from imud.host.log import printable
 from imud.model.errors import BadArgument, CommandError, reason_of
@@ -298,22 +298,33 @@ class DeviceSettings:
         if (resets := self.counter_resets) != self.resets:
             own_until_ns = self.lock.ended_ns + OWN_NS
             is_own = self.lock.can_restart or now_ns < own_until_ns + BOOT_NS
-            self.resets_requested, self.resets = self.resets_requested + is_own * (resets - self.resets), resets
-            if not is_own:
-                self._in_flash.started()
+            self._count_resets(resets, is_own=is_own)
             if not self.lock.can_restart and now_ns >= own_until_ns:
+                self._in_flash.started()
                 self._after_start(SETTLE_NS)
+                if not self._transport.may_ask:
+                    self.is_current = False  # imud does not know which unsaved values the restart has removed
                 if not self.declared and (self._read_ns is None or not self._transport.may_ask):
                     self.comparison.cancel()  # imud has not read the settings, or must not
         if self.comparison.due_ns is not None and self.lock.work is None and self._transport.can_be_asked:
             self.comparison.start_if_due(now_ns)
 
+    def _count_resets(self, resets: int, *, is_own: bool) -> None:
+        """Note the resets of the device counter. `is_own`: a script of imud caused the new resets."""
+        if is_own:
+            self.resets_requested += resets - self.resets
+        self.resets = resets
+
     def after_silence(self) -> None:
         """Compare the settings of a device that has no counter: it can have restarted in the pause of its samples."""
-        driver, may_ask = self._transport.driver, bool(self.declared) or (self.is_unsaved and self._transport.may_ask)
-        if driver is not None and driver.tick_ns == SAMPLE_COUNTER and may_ask:
+        driver = self._transport.driver
+        if driver is None or driver.tick_ns != SAMPLE_COUNTER:
+            return
+        if self.declared or (self.is_unsaved and self._transport.may_ask):
             self._read_resets = None
             self.comparison.schedule(SETTLE_NS)
+        elif self.is_unsaved:
+            self.is_current = False  # imud must not read which values a restart has removed
 
     def forget(self) -> None:
         """Note that the settings of the device may differ from the last values."""
@@ -348,6 +359,20 @@ class DeviceSettings:
         if before.serial_number and identity.serial_number != before.serial_number:
             message = f"another device: serial number {identity.serial_number}, was {before.serial_number}"
             self.raise_event(message, serial_number=identity.serial_number)
+            self._forget_device()
+
+    def _forget_device(self) -> None:
+        """Discard all values of a former device on the same port. The next read stores the values of the new device."""
+        self._reports = {}
+        self.values = {}
+        self.shown = {}
+        self.is_current = False
+        self._read_ns = self._read_resets = None
+        self._written = {}
+        self.is_unsaved = False
+        self._saved = None
+        self._in_flash.found()
+        self._differing = {}
 
     def update(self, reports: Reports, *, own: bool = False) -> None:
         """Store all reports. Raise an event if a known setting has another value, and compare the GPIO lines.
@@ -507,7 +532,11 @@ class DeviceSettings:
     def _mark_unsaved(self, before: Values | None) -> None:
         """Note that the flash does not contain the present settings. `before`: the values before the write."""
         if not self.is_unsaved:
-            self.is_unsaved, self._saved, self.resets = True, before, self.counter_resets
+            self.is_unsaved = True
+            self._saved = before
+            # A restart since the last tick can be earlier or later than the write. The change counts as unsaved until
+            # the next read shows the values: a wrong warning is better than a lost value without a warning.
+            self._count_resets(self.counter_resets, is_own=self.lock.can_restart)
         self._in_flash.follows = False
 
     def spend_flash(self) -> None:

@@ -105,6 +105,10 @@ class DeviceRefused(ImudError):
     """Reply from an unexpected device, or a rejected setting. Example: a wrong product id."""
 
 
+class NotApplied(Rejected, DeviceRefused):
+    """Write that the device confirmed, but does not report. The effect can follow later."""
+
+
 class NothingHeard(ImudError):
     """Detection without a device on the link. Example: no valid frame at any of the six baud rates."""
 

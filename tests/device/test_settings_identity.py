@@ -87,8 +87,11 @@ def test_texts_of_a_device_have_limited_printable_characters() -> None:
     update(known, Identity(HOSTILE, HOSTILE, HOSTILE, many), dict.fromkeys(names, "old"))
     update(known, Identity("HI14", "B2"), dict.fromkeys(names, HOSTILE))
     update(known, Identity(HOSTILE, HOSTILE, HOSTILE, many), {})
-    assert len(events) == 3
-    assert set(names[:-1]) <= set(events[1].detail)
+    # the settings of another device are not a change
+    assert [event.message[:15] for event in events] == ["another device:"] * 2
+    update(known, Identity(HOSTILE, HOSTILE, HOSTILE, many), dict.fromkeys(names, "old"))
+    update(known, Identity(HOSTILE, HOSTILE, HOSTILE, many), dict.fromkeys(names, HOSTILE))
+    assert set(names[:-1]) <= set(events[2].detail)
     shown = [known.identity, known.shown, identity_words(known.identity), *events]
     for one in shown:
         assert len(msgspec.json.encode(one)) < 100_000

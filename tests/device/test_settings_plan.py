@@ -1,8 +1,6 @@
-"""The plan: written settings, their order, and settings that need a save. Results of writes, order of save and restart.
-test_settings.py tests failures."""
+"""The plan: written settings, their order, and settings that need a save.
+test_settings_writes.py tests the writes."""
 
-import asyncio
-from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import Any
 
@@ -10,14 +8,11 @@ import msgspec
 import pytest
 
 from imud.contracts import setting
-from imud.contracts.command import Risk, Target, VerbResult
+from imud.contracts.command import Risk, Target
 from imud.device import settings_plan
-from imud.device.evidence import SampleWatch
-from imud.device.flash import FlashWrites, ModuleFlash
 from imud.drivers import DRIVERS
 from imud.drivers.hipnuc.uart.settings import AngleAlarm
-from imud.host.clock import HostClock
-from imud.model.errors import BadArgument, LinkMissing, NoReply
+from imud.model.errors import BadArgument
 from tests.support.fake_drivers import FACTORY, FAKE_SETTINGS
 
 ACTUAL = {name: value for name, value in FACTORY.items() if name != "secret"}
@@ -274,132 +269,3 @@ def test_a_command_that_a_setting_replaces(
     assert settings_plan.setting_instead("bow", name, None, given) is None
     for other in ("dance", "magnetometer_bias"):
         assert settings_plan.setting_instead("bow", other, DRIVERS["hipnuc-uart"], given) is None
-
-
-class TableOfOne:
-    """A device with the setting `x`. Its scripts run when they are created."""
-
-    def __init__(
-        self, result: object, *, readable: bool = True, effect: setting.Effect = setting.Effect.IMMEDIATELY, **more: Any
-    ) -> None:
-        self.actual: dict[str, Any] = {"x": 1}
-        self.active: dict[str, Any] = {"x": 1} if readable else {}
-        self.done: list[str] = []
-        self.result = result
-        self.restarted: VerbResult | None = VerbResult(True, "")
-        self.table = setting.SettingsTable(
-            table={"x": setting.Setting(type=int, write=self._write, effect=effect, **more)},
-            read=self._read, save=lambda _target: self._do("save"), restart=lambda _target: self._restart(),
-        )  # fmt: skip
-
-    def _do(self, name: str) -> None:
-        self.done.append(name)
-
-    def _write(self, _target: Target, value: int) -> object:
-        self._do(f"x={value}")
-        self.actual = {"x": value}
-        if self.result is setting.Written.VERIFIED or self.result is None:
-            self.active = dict(self.actual) if self.active else {}
-        if isinstance(self.result, Exception):
-            raise self.result
-        return self.result
-
-    def _read(self, _target: Target, _names: Collection[str] | None) -> setting.Reports:
-        self._do("read")
-        return {"": setting.DeviceReport(values=dict(self.active))}
-
-    def _restart(self) -> VerbResult | None:
-        self._do("restart")
-        self.active = dict(self.actual) if self.active else {}
-        return self.restarted
-
-
-class OnePort(settings_plan.SettingsPort):
-    """Port that runs each script when it is created."""
-
-    driver = path = None
-    where, can_be_asked = "", True
-
-    def __init__(self) -> None:
-        self.samples = SampleWatch(self)
-
-    def require_replies(self) -> None:
-        """Raise no error: the device always replies."""
-
-    async def run_script(self, make: Callable[..., Any], *arguments: Any) -> Any:
-        return make(TARGET, *arguments)
-
-
-class CountedFlash(ModuleFlash):
-    """Flash that may be written, and the number of writes."""
-
-    def __init__(self) -> None:
-        super().__init__(FlashWrites(None, HostClock()), "module", asked=True)
-
-    @property
-    def counted(self) -> int:
-        return self.writes.record("module").writes
-
-
-def applied(
-    device: TableOfOne, *, save: bool = True, flash: CountedFlash | None = None, by_name: bool = False
-) -> setting.AppliedSettings:
-    plan = settings_plan.make_plan(
-        device.table, TARGET, {"x": 2}, device.active, {}, save=save, unsaved=False, by_name=by_name
-    )
-    port, reports = OnePort(), {"": setting.DeviceReport(values=device.active)}
-    applying = settings_plan.Applying(device.table, port, flash or CountedFlash(), {"x": 2}, reports)
-    return asyncio.run(applying.carry_out(plan))
-
-
-def test_values_are_written_read_back_saved_and_compared() -> None:
-    device, flash = TableOfOne(None), CountedFlash()
-    found = applied(device, flash=flash)
-    assert device.done == ["x=2", "read", "save"]
-    assert (found.steps[0].outcome, found.saved, found.restarted, found.differences) == (
-        setting.StepOutcome.VERIFIED, True, False, {},
-    )  # fmt: skip
-    assert flash.counted == 1
-    device = TableOfOne(setting.Written.PENDING, effect=setting.Effect.AFTER_RESTART)
-    found = applied(device)
-    assert device.done == ["x=2", "read", "save", "restart", "read"]
-    assert (found.steps[0].outcome, found.restarted) == (setting.StepOutcome.VERIFIED, True)
-    device = TableOfOne(setting.Written.PENDING)
-    found = applied(device)
-    assert device.done == ["x=2", "read", "save", "restart", "read"]
-    assert found.steps[0].outcome is setting.StepOutcome.VERIFIED
-    no_samples = "the device sends no samples that show a restart"
-    for device.restarted, doubt in ((VerbResult(False, "no pause"), "no pause"), (None, no_samples)):
-        device.active = {"x": 1}
-        found = applied(device)
-        assert (found.steps[0].outcome, found.restarted, found.problem) == (setting.StepOutcome.WRITTEN, False, "")
-        assert found.ends[-1] == f"restart: sent, not verified: {doubt}"
-    device = TableOfOne(setting.Written.PENDING)
-    found = applied(device, save=False)
-    assert device.done == ["x=2", "read"]
-    assert found.steps[0].outcome is setting.StepOutcome.WRITTEN
-    assert list(found.differences) == ["x"]
-    device, flash = TableOfOne(setting.Written.VERIFIED, saves=True, connection=True), CountedFlash()
-    found = applied(device, flash=flash)
-    assert (device.done, (found.saved, flash.counted)) == (["x=2", "read"], (True, 1))
-    device = TableOfOne(setting.Written.PENDING, effect=setting.Effect.AFTER_RESTART, connection=True, bus_rate=True)
-    done = applied(device, by_name=True)
-    assert (done.saved, done.restarted, done.problem) == (True, False, "")
-    assert [one for one in device.done if one != "read"] == ["x=2", "save"]
-
-
-@pytest.mark.parametrize("result", [setting.Written.UNVERIFIED, setting.Written.UNVERIFIED_PENDING])
-def test_an_unreadable_value_is_not_verified_and_another_value_is_a_failure(result: setting.Written) -> None:
-    found = applied(TableOfOne(result, readable=False))
-    assert found.steps[0].outcome is setting.StepOutcome.NOT_VERIFIED
-    assert (found.saved, found.problem, found.differences) == (True, "", {})
-    found = applied(TableOfOne(setting.Written.UNVERIFIED))
-    assert found.steps[0].message == "wrote 2, read back 1"
-
-
-@pytest.mark.parametrize("error", [NoReply("no answer"), LinkMissing("pulled out")])
-def test_errors_of_device_and_link_are_part_of_the_result(error: Exception) -> None:
-    device = TableOfOne(error)
-    device.result = error
-    assert applied(device).problem == f"x: {error}; no other setting was written"
-    assert device.done == ["x=2", "read"]
