@@ -27,7 +27,7 @@ from docs.generate.alert_table import alert_table
 from docs.generate.python_reference import python_reference
 from docs.generate.settings_parts import docs_of, settings_parts
 from docs.generate.socket_schema import socket_schema
-from imud.contracts.command import Handling, Verb, Verbs, parameters_of
+from imud.contracts.command import Handling, Proof, Verb, Verbs, parameters_of
 from imud.contracts.driver import Driver
 from imud.device.settings_plan import described_settings
 from imud.drivers import DRIVERS
@@ -199,10 +199,29 @@ def arguments_of(action: Verb, lists: LongLists) -> str:
 
 
 def actions_table(actions: Verbs, lists: LongLists) -> Iterator[str]:
-    yield "| command | arguments | effect |"
-    yield "|---|---|---|"
+    yield "| command | arguments | effect | evidence |"
+    yield "|---|---|---|---|"
     for name, action in actions.items():
-        yield f"| `{name}` | {arguments_of(action, lists)} | {cell(action.help.rstrip('.'))} |"
+        arguments = arguments_of(action, lists)
+        yield f"| `{name}` | {arguments} | {cell(action.help.rstrip('.'))} | {cell(evidence_of(action))} |"
+
+
+# Evidence that imud accepts for the effect of a command
+EVIDENCE: Final[Mapping[Proof, str]] = {
+    Proof.VALUE: "the reply is the result",
+    Proof.RESTART: "the device counter restarts",
+    Proof.SETTINGS: "the device reports other settings, and none was unsaved before",
+    Proof.SAMPLES: "the samples at rest have the set value, and did not have it before",
+    Proof.STREAM: "a sample arrives, and none arrived for 1.5 s before",
+    Proof.ONE_SAMPLE: "a sample arrives, and none arrived for 1.5 s before",
+}
+
+
+def evidence_of(action: Verb) -> str:
+    """Return the evidence for the effect of an action, or the reason why there is none."""
+    if action.proof is Proof.NONE:
+        return f"none: {action.evidence}"
+    return action.evidence or EVIDENCE[action.proof]
 
 
 def actions_part(driver: Driver, lists: LongLists, first_of: dict[str, str]) -> list[str]:

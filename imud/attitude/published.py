@@ -189,6 +189,13 @@ class PublishedAxes:
     def _order(self) -> EulerOrder:
         return self.device.order if self.convention is None else EulerOrder.ZYX
 
+    @property
+    def yaw_sense(self) -> int:
+        """Return 1 if the published yaw and the yaw of the device grow in the same sense, otherwise -1."""
+        if self.convention is None:
+            return 1
+        return 1 if (self.convention is Convention.NED_FRD) == self.device.z_down else -1
+
     # --- readable text ---------------------------------------------------------------------------------------------
 
     def heading(self, device: Heading) -> Heading:

@@ -55,7 +55,8 @@ def command(args: argparse.Namespace) -> int:
             return 1
         answer = client.call("command", device=args.device, name=args.name, arguments=arguments)
     print(_verb_words(answer))
-    return 0
+    # also 1 if the device has ignored the command
+    return 1 if isinstance(answer, dict) and answer.get("failed") else 0
 
 
 def _verb_words(answer: Any) -> str:

@@ -38,15 +38,20 @@ class Risk(StrEnum):
 
 
 class Proof(StrEnum):
-    """Evidence for the effect of a verb."""
+    """Evidence for the effect of a verb: an observation that an unchanged device cannot cause.
+
+    imud reports "sent, not verified" if it only has other observations, for example a pause of the samples, a sample of
+    a device that sent samples before, or angles that agreed before. docs/commands.md contains the evidence of each
+    verb.
+    """
 
     VALUE = "value"  # the verb has no effect: its result is the requested value
     SCRIPT = "script"  # the script has checked the effect; it may return a `VerbResult`
     NONE = "none"  # the device does not show the effect
-    RESTART = "restart"  # the device counter restarts; without a counter the samples pause
+    RESTART = "restart"  # the device counter restarts; a device without a counter does not show a restart
     SETTINGS = "settings"  # the device reports other settings than before
-    SAMPLES = "samples"  # the samples at rest have the values of `Verb.expected`
-    STREAM = "stream"  # a sample arrives
+    SAMPLES = "samples"  # the samples at rest have the values of `Verb.expected`, and did not have them before
+    STREAM = "stream"  # samples arrive, and none arrived before
     ONE_SAMPLE = "one sample"  # a sample arrives, and none arrived before
 
 
@@ -57,6 +62,7 @@ class VerbResult(msgspec.Struct, frozen=True):
     evidence: str  # evidence for the effect, or the reason why imud could not verify the effect
     result: Any = None  # values that the verb returns
     not_saved: str = ""  # that the flash lacks a change, and the next step; empty if the flash contains all settings
+    failed: bool = False  # whether the evidence shows that the effect did not occur; False if it is not known
 
 
 def _always(_arguments: Any) -> bool:
@@ -89,6 +95,9 @@ class Verb:
     restarts: bool = False
     # Returns whether the device restarts, from the arguments, for a verb that restarts it with some arguments only
     restarts_with: "Callable[[Any], bool]" = _always
+    # Name of the argument with a published heading, degrees; empty if there is none. The script gets the yaw of the
+    # device.
+    heading: str = ""
     proof: Proof = Proof.VALUE
     evidence: str = ""  # evidence of `Proof.SCRIPT`, or the reason of `Proof.NONE`, one clause
     # Returns the expected means of the samples after the verb, from its arguments; empty if no sample shows the effect

@@ -305,6 +305,7 @@ class CalibrationRun:
     def __init__(self, transport: Transport, events: DeviceEvents) -> None:
         self._transport = transport
         self._events = events
+        self.is_sent = False  # whether imud has sent the start of the newest calibration
         self._running: asyncio.Task[CalibrationResult] | None = None
         self.status: CalibrationStatus | None = None  # running calibration; None if none is running
         self._tick_future: asyncio.Future[tuple[int, Sample | None]] | None = None
@@ -342,6 +343,7 @@ class CalibrationRun:
             raise CommandError(f"{kind}: cannot save: the result lasts {calibration.kept}")
         limit_ns = None if calibration.handling is Handling.REST else TURN_LIMIT_NS
         self.status = CalibrationStatus(kind, "", self._now_ns, limit_ns, REQUESTED_BY.get())
+        self.is_sent = False
         task = self._running = asyncio.ensure_future(self._run(kind, calibration, save))
         try:
             return await task
@@ -387,6 +389,7 @@ class CalibrationRun:
         """Calibrate a device at rest. Return the reply of the device, the checks, and the problem."""
         await self._rest(kind)
         window = RestWindow()
+        self.is_sent = True
         script: asyncio.Future[Any] = asyncio.ensure_future(self._transport.run_script(calibration.begin))
         try:
             while not script.done():
@@ -412,6 +415,7 @@ class CalibrationRun:
         """Calibrate a turned device. Return the reply of the device, the checks, and the problem."""
         ask = calibration.verdict
         before = verdict = await self._transport.run_script(ask) if ask is not None else Verdict(done=False, words="")
+        self.is_sent = True
         await self._transport.run_script(calibration.begin)
         turning, begun_ns = Turning(is_planar=calibration.handling is Handling.SPIN), self._now_ns
         report_ns = ask_ns = begun_ns

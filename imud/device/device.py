@@ -39,7 +39,7 @@ from imud.device.latency import Need
 from imud.device.settings import DeviceSettings, identity_words
 from imud.device.settings_plan import setting_instead
 from imud.device.transport import UNHEARD_NS, DeviceContext, DeviceOwner, Transport
-from imud.device.verb_run import VerbRun
+from imud.device.verbs import VerbRun
 from imud.device.watches import AttitudeWatch, StatusWatch
 from imud.drivers import DRIVERS
 from imud.host.clock import HostClock
@@ -394,7 +394,9 @@ class Device:
             finally:
                 if result is not None and result.saved:  # the save writes all settings
                     self.settings.flash_is_current(changed=False)
-                self.settings.changed(unsaved=result is None or (result.kept is Kept.BY_SAVE and not result.saved))
+                is_unsaved = result is None or (result.kept is Kept.BY_SAVE and not result.saved)
+                if self._calibration.is_sent:  # a refused calibration has changed nothing
+                    self.settings.changed(unsaved=is_unsaved)
             await self.settings.read_again(identity=False)  # a calibration changes reports, for example an offset
             return result
 

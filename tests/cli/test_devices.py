@@ -29,7 +29,7 @@ def test_devices_and_verbs_are_listed_and_a_module_obeys(daemon: RunningDaemon, 
     assert [line.split()[0] for line in out.splitlines() if not line.startswith(" ")] == [
         "save", "restart", "factory_reset", "wake", "output_once", "level", "yaw", "reset_attitude", "ins_config",
     ]  # fmt: skip
-    assert "angle_deg (a number from -180 to 180)" in out
+    assert "angle_deg (a number from -180 to 360)" in out
     out = cli("command", "--socket", daemon.socket, "bow", "yaw", "angle_deg=16").out
     assert out.startswith("sent, not verified: the device moves: ")
 
@@ -37,7 +37,7 @@ def test_devices_and_verbs_are_listed_and_a_module_obeys(daemon: RunningDaemon, 
 @live
 def test_mistakes_are_explained(daemon: RunningDaemon, cli: Cli) -> None:
     for words, expected in [
-        (["yaw", "angle_deg=181"], "arguments: angle_deg (a number from -180 to 180)"),
+        (["yaw", "angle_deg=361"], "arguments: angle_deg (a number from -180 to 360)"),
         (["mode", "axes=9"], "mode is a setting: imud settings bow --set mode=9-axis"),
         (["output", "message=HI91", "rate_hz=200"], "output is a setting: imud settings bow --set output.hi91=200"),
         (["baud"], "baud is a setting: imud settings bow --set baud=BAUD --save"),
@@ -61,6 +61,10 @@ def test_a_risk_is_confirmed_and_the_result_has_its_evidence(cli: Cli, monkeypat
         "verified: it replied\n[1]\nlasts until power-off", "verified: it replied", '{"verified":true}', "done",
     ):  # fmt: skip
         assert cli("command", "bow", "reset", "--yes").out == words + "\n"
+    answers = iter([result | {"verified": False, "failed": failed} for failed in (True, False)])
+    for status in (1, 0):  # 1 if the device has ignored the command
+        answer = cli("command", "bow", "reset", "--yes", status=status).out
+        assert answer.startswith("sent, not verified: it replied")
     assert made.call_args.kwargs == {"timeout_s": 180.0}, "a calibration takes two minutes"
 
 

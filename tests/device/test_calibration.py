@@ -445,6 +445,8 @@ async def test_a_module_in_six_axis_mode_that_moves_refuses_calibrations(it: Wir
     with pytest.raises(CommandError, match="expected the device at rest"):
         await it.device.calibrate("level", save=True)
     assert it.module.settings.level == before
+    # imud has sent nothing
+    assert not it.device.settings.is_unsaved
     assert not it.device.stop_calibration()
     running = asyncio.ensure_future(it.device.calibrate("level", save=True))
     await it.wait(1)

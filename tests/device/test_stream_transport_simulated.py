@@ -424,8 +424,8 @@ async def test_settings_are_applied_in_an_order_that_keeps_the_connection(bench:
     assert bench.line.baud == bench.module.baud == 460800
     await bench.until_samples()
     sample = await device.act("sample_once", {})
-    assert isinstance(sample, dict)
-    assert sample["accel_m_s2"][2] == pytest.approx(9.8, abs=0.1)
+    assert isinstance(sample, VerbResult)
+    assert sample.result["accel_m_s2"][2] == pytest.approx(9.8, abs=0.1)
     await device.act("restart", {})
     await bench.until_samples()
     await device.act("factory_reset", {})

@@ -46,7 +46,7 @@ from imud.drivers.hipnuc.canopen.cia301 import (
 from imud.drivers.hipnuc.canopen.codec import HipnucCanopenOptions
 from imud.drivers.readdressing import Readdressing
 from imud.formats.can import STANDARD_ID_MAX, CanFilter, pack_frame
-from imud.model.errors import BadArgument, DeviceRefused, NoReply
+from imud.model.errors import BadArgument, NoReply, NotApplied
 from imud.model.units import NS_PER_MS, NS_PER_S
 
 DEVICE_NAME: Final = 0x1008
@@ -233,9 +233,7 @@ def verify(node: int, index: int, sub: int, value: int, *, pending: bool = False
     if found is None:
         return Written.UNVERIFIED_PENDING if pending else Written.UNVERIFIED
     if _number(found) != value:
-        raise DeviceRefused(
-            f"node {node}: expected 0x{index:04X}.{sub} = {value} after the write, got {_number(found)}"
-        )
+        raise NotApplied(f"node {node}: expected 0x{index:04X}.{sub} = {value} after the write, got {_number(found)}")
     return Written.PENDING if pending else Written.VERIFIED
 
 

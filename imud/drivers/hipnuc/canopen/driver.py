@@ -263,6 +263,7 @@ VERBS: Final[Verbs] = {
         lambda target: commands.restart(target.settings, target.baud),
         restarts=True,
         proof=Proof.RESTART,
+        evidence="the node sends its boot-up message (0x700 + node), or moves to another number",
     ),
     "factory_reset": Verb(
         "restore the factory settings with node 8 and 500 kbit/s, effective after a restart; imud rejects it if "

@@ -36,10 +36,10 @@ from imud.drivers.hipnuc.j1939.codec import (
     J1939Node,
     NodeOptions,
 )
-from imud.drivers.readdressing import Readdressing
+from imud.drivers.readdressing import LISTEN_NS, Readdressing
 from imud.formats.can import CanFilter, pack_frame
 from imud.formats.j1939 import ADDRESS_MAX, CLAIMED, REQUEST, WITHOUT_PRIORITY, J1939Id, filter_of, join, split
-from imud.model.errors import NoReply, Rejected
+from imud.model.errors import NoReply, NotApplied, Rejected
 from imud.model.units import NS_PER_MS, NS_PER_S
 
 LAYOUT: Final = struct.Struct("<HBBI")  # register, command, status, value
@@ -191,8 +191,11 @@ def zero(peer: J1939Node, what: Zero) -> RequestScript[None]:
     return _write(peer, ZERO, what.value, "zero")
 
 
-def send_once(peer: J1939Node, pgn: int) -> RequestScript[None]:
-    """Send a message once, in addition to its interval. The message is the reply."""
+def send_once(peer: J1939Node, pgn: int) -> RequestScript[VerbResult]:
+    """Send a message once, in addition to its interval, and return the evidence. The message is the reply.
+
+    A message that also arrives without the request is not evidence.
+    """
     name = f"send {pgn:04X} once"
     asked = exchange(peer, ONCE, WRITE, pgn, name)
     wanted = filter_of(pgn, peer.address)
@@ -200,10 +203,15 @@ def send_once(peer: J1939Node, pgn: int) -> RequestScript[None]:
     def is_message(message: Message) -> bool:
         return isinstance(message, ReplyFrame) and wanted.matches(message.frame_id, True)
 
+    listening = Request(b"", f"{pgn:04X} without a request", is_message, never, never, LISTEN_NS, also=(wanted,))
+    is_periodic = isinstance((yield listening), Reply)
     outcome = yield replace(asked, is_end=is_message, is_part=never, also=(wanted,))
     if isinstance(outcome, Silence):
         raise NoReply(f"{name}: expected the message from address {peer.address}, got none")
     _refuse(name, outcome)
+    if is_periodic:
+        return VerbResult(False, f"the device also sends {pgn:04X} without the request")
+    return VerbResult(True, f"{pgn:04X} arrived, and did not arrive before the request")
 
 
 def save(peer: J1939Node) -> RequestScript[None]:
@@ -229,7 +237,7 @@ def verify(peer: J1939Node, register: int, value: int, name: str, *, pending: bo
     except (NoReply, Rejected):
         return Written.UNVERIFIED_PENDING if pending else Written.UNVERIFIED
     if now != value:
-        raise Rejected(f"{name}: expected {value} after the write, got {now}")
+        raise NotApplied(f"{name}: expected {value} after the write, got {now}")
     return Written.PENDING if pending else Written.VERIFIED
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Final, Literal
 from msgspec import Meta
 
 from imud.attitude.rotation import euler312_from_quat
-from imud.contracts.command import Proof, Risk, Target, Verb, Verbs
+from imud.contracts.command import Proof, Risk, Target, Verb, VerbResult, Verbs
 from imud.contracts.driver import SAMPLE_COUNTER, CanDriver, random_vector
 from imud.contracts.script import RequestScript
 from imud.contracts.setting import DeviceReport, Effect, Reports, Setting, SettingsTable
@@ -202,7 +202,7 @@ SETTINGS: Final = SettingsTable(
 Pgn = Annotated[PgnName, Meta(description="last four digits of the PGN", extra={"section": "6.1"})]
 
 
-def _send_once(target: Target, *, pgn: Pgn) -> RequestScript[None]:
+def _send_once(target: Target, *, pgn: Pgn) -> RequestScript[VerbResult]:
     return commands.send_once(target.settings.peer, int(pgn, 16))
 
 
@@ -219,6 +219,7 @@ VERBS: Final[Verbs] = {
         lambda target: commands.restart(target.settings, target.baud),
         restarts=True,
         proof=Proof.RESTART,
+        evidence="the device moves to another address or reports other settings; on CAN FD also: its counter restarts",
     ),
     "factory_reset": Verb(
         "restore the factory settings with address 8 and its bit rate, effective after a restart at the latest; "
@@ -233,7 +234,7 @@ VERBS: Final[Verbs] = {
         _send_once,
         changes=False,
         proof=Proof.SCRIPT,
-        evidence="the message arrived",
+        evidence="the message arrives, and did not arrive for 1.1 s before",
     ),
     "zero": Verb("make the present position zero, or cancel it", _zero, proof=Proof.SAMPLES, expected=zeroed),
 }

@@ -40,7 +40,7 @@ from imud.model.errors import BadArgument
 from imud.model.units import NS_PER_MS
 
 
-def _restart(target: Target) -> TransferScript[VerbResult]:
+def _restart(target: Target) -> TransferScript[str | VerbResult]:
     return commands.restart(commands.places_of(target), target.baud)
 
 
@@ -73,6 +73,7 @@ VERBS: Final[Verbs] = {
         _restart,
         restarts=True,
         proof=Proof.RESTART,
+        evidence="the uptime restarts, the device moves to another address, or it reports other settings than before",
     ),
     "factory_reset": Verb(
         "restore the factory settings and restart: imud follows the device to address 80 if no other device uses it "

@@ -476,12 +476,29 @@ def change_baud(baud: BaudRate, present_baud: int) -> RequestScript[int]:
     heard = yield from find((present_baud, baud) if answered else (baud, present_baud))
     if heard == present_baud != baud and not answered:
         raise NoReply(f"SERIALCONFIG {baud}: expected OK, got no reply; the device keeps {present_baud} baud")
+    if heard != baud:
+        yield from _require_reported_baud(baud, present_baud)
     yield from send(save_config())
     yield reboot()
     _, heard = yield from _found_after_boot((baud, present_baud))
     if heard != baud:
         raise Rejected(f"SERIALCONFIG {baud}: the device keeps {heard} baud")
     return heard
+
+
+def _require_reported_baud(baud: BaudRate, present_baud: int) -> RequestScript[None]:
+    """Raise Rejected if the device does not report a baud rate that it uses only after a restart (COMCONFIG).
+
+    It is assumed that the report contains the new baud rate before the restart. imud never saves a change of the link
+    that it cannot verify.
+    """
+    report = yield from read_report(Query.COMCONFIG)
+    reported = (report or {}).get("BAUD", "no baud rate")
+    if reported != str(baud):
+        raise Rejected(
+            f"SERIALCONFIG {baud}: the device replied OK, but still uses {present_baud} baud and reports {reported}; "
+            "imud did not save or restart it"
+        )
 
 
 def reset_to_factory(present_baud: int) -> RequestScript[int]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from math import remainder
 from random import Random
 from typing import Annotated, Any, Final, Literal
 
@@ -79,7 +80,17 @@ from imud.model.sample import Measurement, Position
 from imud.model.units import NS_PER_MS
 
 Message = Annotated[OutputMessage, Meta(extra={"section": "2.2.5"})]
-Degrees = Annotated[float, Meta(ge=-180, le=180, extra={"unit": "°", "section": "2.2.4"})]
+DEGREES_PER_TURN: Final = 360.0
+Degrees = Annotated[
+    float,
+    Meta(
+        ge=-180,
+        le=360,
+        description="heading as imud publishes it, with `convention`, `frame` and `declination_deg`; without them "
+        "counter-clockwise from above",
+        extra={"unit": "°", "section": "2.2.4"},
+    ),
+]
 
 
 def _restart(target: Target) -> RequestScript[Identity]:
@@ -121,7 +132,8 @@ def _yaw(
     angle_deg: Degrees,
     relative: Annotated[bool, Meta(description="whether to add the angle to the present heading")] = False,
 ) -> RequestScript[None]:
-    return send(commands.yaw(YawMode.RELATIVE if relative else YawMode.ABSOLUTE, angle_deg))
+    mode = YawMode.RELATIVE if relative else YawMode.ABSOLUTE
+    return send(commands.yaw(mode, remainder(angle_deg, DEGREES_PER_TURN)))
 
 
 VERBS: Final[Verbs] = {
@@ -157,6 +169,7 @@ VERBS: Final[Verbs] = {
         "set the heading; lost at power-off",
         _yaw,
         changes=False,
+        heading="angle_deg",
         proof=Proof.SAMPLES,
         expected=lambda given: () if given.relative else (yaw_at(given.angle_deg),),
     ),

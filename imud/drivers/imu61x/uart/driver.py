@@ -25,7 +25,7 @@ from imud.contracts.command import (
     yaw_at,
 )
 from imud.contracts.driver import StreamDriver, random_vector
-from imud.contracts.script import ReplyFrame, Request, RequestScript, pause
+from imud.contracts.script import Reply, ReplyFrame, Request, RequestScript, pause
 from imud.drivers.imu61x.common import (
     EULER_CONVENTION,
     NAVIGATION_FRAME,
@@ -163,8 +163,15 @@ def _installation_status() -> RequestScript[Mapping[str, str]]:
 
 
 Heading = Annotated[
-    float, Meta(ge=0, le=360, description="the new heading", extra={"unit": "°", "section": "1.6, table 12, CMD 4"})
+    float,
+    Meta(
+        ge=0,
+        le=360,
+        description="heading as imud publishes it, with `convention`, `frame` and `declination_deg`",
+        extra={"unit": "°", "section": "1.6, table 12, CMD 4"},
+    ),
 ]
+DEGREES_PER_TURN: Final = 360.0
 Answer = Mapping[str, Any]  # result of a verb, by name
 
 _STOP_NOTE: Final = "no samples until `start_streaming`; with `save`, the device is silent after every power-on"
@@ -174,17 +181,47 @@ def _done(target: Target) -> int:
     return codes_of(target).result_done
 
 
-def _factory_reset(target: Target) -> RequestScript[settings.BaudChange]:
-    return settings.with_advice(settings.factory_reset(target.baud, done=_done(target)), target.fixed_baud)
+def _factory_reset(target: Target) -> RequestScript[VerbResult]:
+    had_factory_values = not (yield from settings.read_differences_from_factory())
+    script = settings.factory_reset(target.baud, done=_done(target))
+    change = yield from settings.with_advice(script, target.fixed_baud)
+    if had_factory_values:
+        return VerbResult(False, "all parameters had their factory values before the command", change)
+    return VerbResult(True, "all parameters have their factory values, and some had other values before", change)
 
 
-def _stop(target: Target) -> RequestScript[Answer]:
+def _streams() -> RequestScript[bool]:
+    """Return whether the device sends samples without a request."""
+    return isinstance((yield commands.await_sample(settings.QUIET_NS)), Reply)
+
+
+def _sample_once(_target: Target) -> RequestScript[VerbResult]:
+    is_streaming = yield from _streams()
+    words = yield from settings.sample_once()
+    if is_streaming:
+        return VerbResult(False, "the device also sends samples without the request", words)
+    return VerbResult(True, "a sample arrived, and none arrived before the request", words)
+
+
+def _start(target: Target) -> RequestScript[VerbResult]:
+    was_streaming = yield from _streams()
+    yield from settings.start_streaming(done=_done(target))
+    if was_streaming:
+        return VerbResult(False, "the device also sent samples before the command")
+    return VerbResult(True, "a sample arrived, and none arrived before the command")
+
+
+def _stop(target: Target) -> RequestScript[VerbResult]:
+    was_streaming = yield from _streams()
     yield from settings.stop_streaming(done=_done(target))
-    return {"output_mode": "command", "configuration": _STOP_NOTE}
+    result = {"output_mode": "command", "configuration": _STOP_NOTE}
+    if was_streaming:
+        return VerbResult(True, "samples arrived before the command, and none after it", result)
+    return VerbResult(False, "the device also sent no samples before the command", result)
 
 
 def _heading(target: Target, *, heading_deg: Heading = 0.0) -> RequestScript[None]:
-    return settings.reset_heading(heading_deg, done=_done(target))
+    return settings.reset_heading(heading_deg % DEGREES_PER_TURN, done=_done(target))
 
 
 def _gyro(target: Target) -> RequestScript[VerbResult]:
@@ -214,19 +251,23 @@ VERBS: Final[Verbs] = {
         changes=False,
     ),
     "sample_once": Verb(
-        "read and publish one sample, also in command mode", lambda _target: settings.sample_once(), changes=False
+        "read and publish one sample, also in command mode",
+        _sample_once,
+        changes=False,
+        proof=Proof.SCRIPT,
+        evidence="a sample arrives, and none arrived for 1.2 s before",
     ),
     "start_streaming": Verb(
         "start sending samples and wait for the first sample",
-        lambda target: settings.start_streaming(done=_done(target)),
+        _start,
         proof=Proof.SCRIPT,
-        evidence="a sample arrived",
+        evidence="a sample arrives, and none arrived for 1.2 s before",
     ),
     "stop_streaming": Verb(
         "enter command mode: send only replies until `start_streaming`; no program receives samples",
         _stop,
         proof=Proof.SCRIPT,
-        evidence="no more samples arrived",
+        evidence="no sample arrives for 1.2 s, and samples arrived before",
     ),
     "save": Verb(
         "write all parameters to flash",
@@ -251,12 +292,13 @@ VERBS: Final[Verbs] = {
         saves=True,
         restarts=True,
         proof=Proof.SCRIPT,
-        evidence="all parameters have their factory values",
+        evidence="all parameters have their factory values, and some had other values before",
     ),
     "heading": Verb(
         "set the heading",
         _heading,
         changes=False,
+        heading="heading_deg",
         proof=Proof.SAMPLES,
         expected=lambda given: (yaw_at(given.heading_deg),),
     ),
@@ -264,11 +306,13 @@ VERBS: Final[Verbs] = {
         "measure the bias of the gyroscope at rest, and wait until the offsets change, at most 30 s",
         _gyro,
         proof=Proof.SCRIPT,
+        evidence="the offsets change, and are then constant",
     ),
     "calibrate_installation": Verb(
         "measure the mounting error, and wait until the angles change, at most 30 s",
         _installation,
         proof=Proof.SCRIPT,
+        evidence="the angles change, and are then constant",
     ),
     "installation_status": Verb(
         "request the state of the installation calibration; returns the frame as sent (no document describes it)",

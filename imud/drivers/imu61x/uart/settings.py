@@ -51,7 +51,7 @@ from imud.drivers.imu61x.uart.commands import (
     sample,
     settled,
 )
-from imud.model.errors import BadArgument, NoReply, Rejected
+from imud.model.errors import BadArgument, NoReply, NotApplied, Rejected
 from imud.model.sample import Measurement
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
 
@@ -270,7 +270,7 @@ def _write(request: Request, parameter: Parameter, wanted: int) -> RequestScript
     found = yield from read(parameter)
     if found != wanted:
         word = "" if result is None else f", acknowledged with result {result}"
-        raise Rejected(f"{request.name}: expected {wanted} after the write, got {found:g}{word}")
+        raise NotApplied(f"{request.name}: expected {wanted} after the write, got {found:g}{word}")
 
 
 def write_filters(accel: int | None, gyro: int | None) -> RequestScript[None]:
@@ -477,6 +477,11 @@ def _factory_reset(present_baud: int, done: int) -> RequestScript[BaudChange]:
         word = "none" if result is None else str(result)
         raise Rejected(f"factory reset: expected {expected}, got {words}; acknowledgement {word} ({done} is done)")
     return BaudChange(found[0], (yield from _save(done)))
+
+
+def read_differences_from_factory() -> RequestScript[Mapping[Parameter, float]]:
+    """Read the parameters that differ from the factory settings. Raises NoReply."""
+    return in_command_mode(_not_factory)
 
 
 def _not_factory() -> RequestScript[Mapping[Parameter, float]]:

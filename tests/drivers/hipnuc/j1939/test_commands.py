@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from imud.contracts.command import Target
+from imud.contracts.command import Target, VerbResult
 from imud.contracts.script import Outcome, Rejection, Reply, ReplyFrame, Request, RequestScript, Silence
 from imud.contracts.setting import Written, combined
 from imud.drivers.hipnuc.j1939 import commands as session
@@ -107,12 +107,17 @@ def test_missing_replies_unchanged_values_resets_and_rejected_arguments_are_repo
     with pytest.raises(Rejected, match="restart: the device rejected the request"):
         J1939Bench(variant=J1939Variant(refuses=frozenset({session.CONTROL}))).act("restart")
     begins: list[Callable[[], RequestScript[object]]] = [
-        lambda: session.save(PEER), lambda: session.zero(PEER, Zero.HERE), lambda: session.send_once(PEER, 0xFF34),
+        lambda: session.save(PEER), lambda: session.zero(PEER, Zero.HERE),
         lambda: session.set_interval(PEER, 0xFF34, 10), lambda: session.set_address(PEER, 9),
     ]  # fmt: skip
     for begin in begins:
         with pytest.raises(NoReply, match="address 8"):
             played(begin(), None)
+    once = session.send_once(PEER, 0xFF34)
+    next(once)
+    once.send(Silence(()))
+    with pytest.raises(NoReply, match="address 8"):
+        once.send(Silence(()))
     assert played(session.factory_reset(PEER), None)[1] is None
     with pytest.raises(NoReply, match="register 0x009c"):
         played(session.identify(PEER), None)
@@ -150,6 +155,8 @@ def test_a_reply_with_a_status_is_a_rejection(status: int) -> None:
         (session.factory_reset(PEER), "000006"), (session.read(PEER, 0x009C), "9C0003"),
     ):  # fmt: skip
         request = next(begin)
+        if not request.payload:  # `send_once` first listens
+            request = begin.send(Silence(()))
         reply = ReplyFrame(0x0CEF5508, bytes.fromhex(head) + bytes([status]) + bytes(4))
         assert request.is_rejection(reply)
         assert not request.is_end(reply)
@@ -158,8 +165,10 @@ def test_a_reply_with_a_status_is_a_rejection(status: int) -> None:
 
 
 def test_which_frames_answer_a_request() -> None:
-    """A message that is sent once is its own reply."""
-    request = next(session.send_once(PEER, 0xFF43))
+    """A message that is sent once is its own reply. It is evidence only if it does not arrive without the request."""
+    script = session.send_once(PEER, 0xFF43)
+    assert not next(script).payload
+    request = script.send(Silence(()))
     assert request.is_end(ReplyFrame(0x0CFF4308, bytes(8)))
     assert not request.is_end(ReplyFrame(0x0CFF4309, bytes(8)))
     assert not request.is_end(ReplyFrame(0x0CFF3408, bytes(8)))
@@ -167,8 +176,13 @@ def test_which_frames_answer_a_request() -> None:
     for variant in (J1939Variant(), J1939Variant(confirms_once=True)):
         bench = J1939Bench(J1939Settings(intervals_ms={0xFF34: 1000}), variant=variant)
         bench.run(10_000_000)
-        assert bench.act("send_once", pgn="FF43") is None
+        answer = bench.act("send_once", pgn="FF43")
+        assert isinstance(answer, VerbResult)
+        assert (answer.verified, answer.evidence) == (True, "FF43 arrived, and did not arrive before the request")
         assert [can_id for can_id, _ in bench.heard].count(0x0CFF4308) == 1
+        answer = bench.act("send_once", pgn="FF34")
+        assert isinstance(answer, VerbResult)
+        assert (answer.verified, answer.evidence) == (False, "the device also sends FF34 without the request")
 
     talk = offline_runner(ledger := Ledger())
     talk.start(next(session.read(PEER, X_SIGN)), 0)

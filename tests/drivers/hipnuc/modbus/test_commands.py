@@ -35,7 +35,9 @@ def bench(request: pytest.FixtureRequest) -> ModbusBench:
 
 
 def restarted(bench: ModbusBench) -> VerbResult:
-    return bench.run(commands.restart((bench.at, 7), BAUD))
+    """Restart the device. A report without evidence becomes a result that is not verified."""
+    answer = bench.run(commands.restart((bench.at, 7), BAUD))
+    return answer if isinstance(answer, VerbResult) else VerbResult(False, "", answer)
 
 
 @pytest.mark.manual("B 4.3.1 save")
@@ -197,22 +199,12 @@ def test_devices_with_unexpected_replies() -> None:
     assert "115200 baud and address 80" in bench.run(commands.factory_reset((7,), 9600))
 
 
-@pytest.mark.parametrize(
-    ("boot_ms", "ignores", "verified", "evidence"),
-    [
-        (800, (), True, "the device did not reply to 8 requests, and then replied again"),
-        (800, ("CTRL",), False, "the device replied without a pause"),
-        (200, (), False, "the device replied without a pause"),
-        (300, (), True, "the device did not reply to 3 requests"),
-    ],
-)  # fmt: skip
-def test_requests_without_a_reply_show_a_restart(
-    boot_ms: int, ignores: tuple[str, ...], verified: bool, evidence: str
-) -> None:
+@pytest.mark.parametrize(("boot_ms", "ignores"), [(800, ()), (800, ("CTRL",)), (200, ()), (300, ())])
+def test_pause_is_not_evidence_of_a_restart(boot_ms: int, ignores: tuple[str, ...]) -> None:
+    """A busy device does not reply either. Only its uptime or another address shows a restart."""
     bench = ModbusBench(module(7, variant=SlaveVariant(boot_ms=boot_ms, ignores=frozenset(ignores))))
     found = restarted(bench)
-    assert (found.verified, found.result) == (verified, "found at address 7")
-    assert found.evidence.startswith(evidence)
+    assert (found.verified, found.evidence, found.result) == (False, "", "found at address 7")
     if not ignores:
         bench.run(commands.change_address(7, 9))
         found = restarted(bench)

@@ -227,6 +227,22 @@ class Forgetful(HipnucLine):
         return outcome
 
 
+class Deaf(HipnucLine):
+    """Device that replies OK to SERIALCONFIG and keeps its baud rate, also in its report."""
+
+    def ask(self, request: Request) -> Outcome:
+        return Reply(("OK",)) if request.name.startswith("SERIALCONFIG") else super().ask(request)
+
+
+def test_ignored_baud_rate_is_not_saved() -> None:
+    """A save would also write other changes to the flash, and the restart would lose the measurement for nothing."""
+    line = Deaf()
+    with pytest.raises(Rejected, match="replied OK, but still uses 115200 baud and reports 115200; imud did not save"):
+        line.act("baud", baud=921600)
+    assert not {"SAVECONFIG", "REBOOT"} & set(line.asked)
+    assert line.run(identify()).product == "HI14R3"
+
+
 @pytest.mark.manual("B 2.2.3 a wrong rate")
 def test_a_module_that_refuses_does_not_know_or_does_not_save_another_rate_stays_reachable() -> None:
     line = HipnucLine(hardware=hardware_of(Behaviour(refuses=("SERIALCONFIG",))))
@@ -489,7 +505,7 @@ def test_one_command(name: str, arguments: dict[str, Any], command: str) -> None
 
 
 RATES = r"output.hi91: expected one of 0, 1, 2, 4, 5, 8, 10, 20, 25, 40, 50, 100, 125, 200, 250, 500, 1000, or"
-HALF_TURN = "a number from -180 to 180"
+TURNS = "a number from -180 to 360"
 
 
 @pytest.mark.parametrize(
@@ -503,8 +519,8 @@ HALF_TURN = "a number from -180 to 180"
         ("level", {"level": None}, '"automatic", "cancel", "relative"'),
         ("mounting", {"turned": [1.0] * 8}, "or a list of 9, each item a number"),
         ("mounting", {"turned": [1, 0, 0.0011, 0, 1, 0, 0, 0, 1]}, "expected a rotation .* orthonormal within 0.001, "),
-        ("magnetic_calibration", {"enabled": 2}, "true or false"), ("yaw", {"angle_deg": 180.1}, HALF_TURN),
-        ("yaw", {"angle_deg": math.nan}, HALF_TURN), ("yaw", {"angle_deg": True}, HALF_TURN),
+        ("magnetic_calibration", {"enabled": 2}, "true or false"), ("yaw", {"angle_deg": 360.1}, TURNS),
+        ("yaw", {"angle_deg": math.nan}, TURNS), ("yaw", {"angle_deg": True}, TURNS),
         ("yaw", {"angle_deg": 5, "relative": None}, "true or false"),
         ("pin", {"function": "sin", "pin": 10}, "a whole number from 1 to 9"),
         ("pin", {"function": "sin", "pin": 0}, "a whole number from 1 to 9"),

@@ -218,11 +218,18 @@ def test_every_order_to_a_device_that_refuses_is_an_error(name: str) -> None:
 def test_answers_of_actions() -> None:
     far = imu61x_bench()
     answer = act(far, "stop_streaming")
-    assert answer["output_mode"] == "command"
-    assert "start_streaming" in answer["configuration"]
+    assert (answer.verified, answer.evidence) == (True, "samples arrived before the command, and none after it")
+    assert answer.result["output_mode"] == "command"
+    assert "start_streaming" in answer.result["configuration"]
     assert not far.samples(50)
-    act(far, "start_streaming")
+    # an unchanged device causes the same observations
+    assert not act(far, "stop_streaming").verified
+    sample = act(far, "sample_once")
+    assert (sample.verified, set(sample.result) > {"accel_m_s2"}) == (True, True)
+    assert act(far, "start_streaming").verified
     assert far.samples(50)
+    for name in ("start_streaming", "sample_once"):
+        assert not act(far, name).verified
 
     far = imu61x_bench()
     assert act(far, "baud", baud=460800) == BaudChange(460800, saved=False)
@@ -230,7 +237,7 @@ def test_answers_of_actions() -> None:
 
     far = imu61x_bench()
     assert act(far, "status")["model_number"] == 614
-    assert set(act(far, "sample_once")) > {"accel_m_s2", "gyro_rad_s"}
+    assert set(act(far, "sample_once").result) > {"accel_m_s2", "gyro_rad_s"}
 
     far = imu61x_bench(noise=Noise(3))
     answer = act(far, "calibrate_gyro")
@@ -259,8 +266,14 @@ def test_a_rate_that_the_line_does_not_carry_is_refused_and_a_fixed_rate_is_to_b
 
     far = imu61x_bench(Imu61xSettings(baud=921600))
     answer = far.run(script_of(DRIVER, Target(None, 921600, fixed_baud=921600), "factory_reset", {}))
-    assert answer.configuration == "change `uart.baud` from 921600 to 115200 or auto: imud uses it at its next start"
-    assert far.run(script_of(DRIVER, Target(None, 115200, 0), "factory_reset", {})).configuration == ""
+    assert answer.verified
+    assert (
+        answer.result.configuration
+        == "change `uart.baud` from 921600 to 115200 or auto: imud uses it at its next start"
+    )
+    answer = far.run(script_of(DRIVER, Target(None, 115200, 0), "factory_reset", {}))
+    assert (answer.verified, answer.result.configuration) == (False, "")
+    assert answer.evidence == "all parameters had their factory values before the command"
 
 
 @pytest.mark.parametrize(
