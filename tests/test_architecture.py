@@ -541,7 +541,7 @@ CROSS_CUTTING = {
 """Test modules without a single module, and their subjects."""
 
 TESTED_IN = {
-    "imud.device.timetable": "device/test_polled_bus.py", "imud.device.verbs": "device/test_evidence.py",
+    "imud.device.timetable": "device/test_polled_bus.py",
     "imud.publishers.nmea2000.port": "publishers/nmea2000/test_output.py",
     "imud.cli.schema": "cli/test_main.py", "imud.cli.setup.changes": "cli/setup/test_steps.py",
     "imud.cli.sim": "sim/test_main.py", "imud.sampling.driver_clock": "sampling/test_path.py",
