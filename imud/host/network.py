@@ -123,7 +123,10 @@ def tls_context(ca_file: str | None) -> "ssl.SSLContext":
     import ssl
 
     certificates = None if ca_file is None else _read_certificates(ca_file)
-    context = ssl.create_default_context(cadata=certificates)
+    try:
+        context = ssl.create_default_context(cadata=certificates)
+    except ssl.SSLError as error:
+        raise ssl.SSLError(NO_ERRNO, f"ca_file {ca_file}: expected certificates (PEM), got an invalid one") from error
     context.verify_flags &= ~ssl.VERIFY_X509_STRICT
     return context
 
@@ -141,8 +144,11 @@ def _read_certificates(ca_file: str) -> str:
     """Return the content of a file with at least one certificate (PEM). Raises OSError."""
     import ssl
 
-    content = read_regular_file(ca_file, CA_BYTES_MAX).decode("latin-1")
-    text = content.encode("ascii", "replace").decode("ascii")  # comments in UTF-8
+    try:
+        content = read_regular_file(ca_file, CA_BYTES_MAX)
+    except OSError as error:
+        raise OSError(NO_ERRNO, f"cannot read ca_file {ca_file}: {reason_of(error)}") from error
+    text = content.decode("latin-1").encode("ascii", "replace").decode("ascii")  # comments in UTF-8
     if PEM_CERTIFICATE.search(text) is None:  # with empty data, Python would trust all CAs of the system
-        raise ssl.SSLError(NO_ERRNO, "expected certificates (PEM), got a file without a certificate")
+        raise ssl.SSLError(NO_ERRNO, f"ca_file {ca_file}: expected certificates (PEM), got none")
     return text

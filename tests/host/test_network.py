@@ -15,7 +15,6 @@ from unittest.mock import Mock
 
 import pytest
 
-from imud.host.files import FileTooLong, NotRegularFile
 from imud.host.network import CA_BYTES_MAX, interface_addresses, listen, resolve, tls_context
 from imud.host.scrape_server import HttpRequest, HttpResponse, ScrapeServer
 from imud.model.errors import ServerError
@@ -122,15 +121,16 @@ def test_certificates_of_authorities_without_a_regular_file(tmp_path: Path) -> N
     """OpenSSL would wait for the FIFO. Python would trust the authorities of the system instead of an empty file."""
     fifo = tmp_path / "fifo"
     os.mkfifo(fifo)
-    with pytest.raises(NotRegularFile, match="is a FIFO, expected a regular file"):
+    with pytest.raises(OSError, match=f"cannot read ca_file {fifo}: is a FIFO, expected a regular file"):
         tls_context(str(fifo))
     empty = tmp_path / "empty"
-    for content in (b"", b"\n", b"text"):
+    damaged = b"-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n"
+    for content in (b"", b"\n", b"text", damaged):
         empty.write_bytes(content)
-        with pytest.raises(ssl.SSLError, match="expected certificates"):
+        with pytest.raises(ssl.SSLError, match=rf"ca_file {empty}: expected certificates \(PEM\)"):
             tls_context(str(empty))
     empty.write_bytes(bytes(CA_BYTES_MAX + 1))
-    with pytest.raises(FileTooLong):
+    with pytest.raises(OSError, match="expected at most 1048576 bytes"):
         tls_context(str(empty))
 
 

@@ -165,7 +165,7 @@ class SignalKServer:
         """Connect again and again, until the server denies the access."""
         while self._problem != DENIED:
             try:
-                await self._client.load_certificates()
+                await self._load_certificates()
                 await self._connect_with_token()
             except TimeoutError:
                 self._report(f"{self._url}: no complete reply within {REPLY_S:.0f} s")
@@ -176,6 +176,14 @@ class SignalKServer:
             if self._problem != DENIED:
                 await asyncio.sleep(self._pause_s)
                 self._pause_s = min(2 * self._pause_s, RETRY_MOST_S)
+
+    async def _load_certificates(self) -> None:
+        try:
+            await self._client.load_certificates()
+        except OSError as error:
+            raise UnusableServer(
+                f"signalk: {_reason(error)}; set signalk.ca_file to a file with certificates"
+            ) from None
 
     async def _connect_with_token(self) -> None:
         """Serve one connection. If the server rejects the token, keep it, and make a new access request after some
