@@ -9,7 +9,6 @@ import threading
 from asyncio import AbstractEventLoop
 from collections import Counter
 from collections.abc import Callable
-from pathlib import Path
 from resource import getpagesize
 from types import FrameType
 from typing import Final, Protocol
@@ -27,7 +26,7 @@ host with a slow disk delays the loop by less."""
 GROWTH_BYTES: Final = 256 << 20
 """Growth of the memory that imud reports, bytes. A flight recorder, the queues of all outputs and 500 devices need less
 after the start."""
-MEMORY_NS: Final = 2 * NS_PER_S  # interval of the checks of the memory, ns
+MEMORY_NS: Final = 5 * NS_PER_S  # interval of the checks of the memory, ns
 
 
 class WatchOwner(Protocol):
@@ -106,7 +105,8 @@ class StallWatch:
 def resident_bytes() -> int:
     """Return the size of the process in memory; 0 if the kernel does not report it."""
     try:
-        return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * getpagesize()
+        with open("/proc/self/statm", "rb", buffering=0) as file:
+            return int(file.read(256).split()[1]) * getpagesize()
     except (OSError, ValueError, IndexError):
         return 0
 
@@ -118,13 +118,13 @@ class MemoryWatch:
         self._read_bytes = read_bytes
         self._start_bytes = 0  # size at the first check; 0 before it
         self._limit_bytes = 0
-        self._due_ns = 0
+        self.due_ns = 0  # CLOCK_MONOTONIC of the next check
 
     def check(self, now_ns: int) -> str:
         """Return a text if the process has grown by another GROWTH_BYTES since the first check; otherwise empty."""
-        if now_ns < self._due_ns:
+        if now_ns < self.due_ns:
             return ""
-        self._due_ns = now_ns + MEMORY_NS
+        self.due_ns = now_ns + MEMORY_NS
         size_bytes = self._read_bytes()
         if not self._start_bytes:
             self._start_bytes = size_bytes
@@ -151,7 +151,7 @@ class ProcessWatch:
     def tick(self, now_ns: int) -> None:
         """Report a block that has ended, and a growth of the memory. Called at each tick of the daemon."""
         self._stalls.beat(now_ns)
-        if text := self._memory.check(now_ns):
+        if now_ns >= self._memory.due_ns and (text := self._memory.check(now_ns)):
             self._owner.on_growth(text)
 
     def close(self) -> None:

@@ -154,9 +154,17 @@ class Outputs:
 
     def tick(self, now_ns: int) -> None:
         """Call `tick` of the outputs. Start failed outputs after their pause."""
-        for publisher, scope, _ in self._ticked:
-            if not scope.is_closed:
-                scope.call(publisher.tick, now_ns)
+        outer = INNERMOST.scope
+        try:
+            for publisher, scope, _ in self._ticked:
+                if not scope.is_closed:
+                    INNERMOST.scope = scope  # as in `publish`
+                    try:
+                        publisher.tick(now_ns)
+                    except BaseException as error:  # noqa: BLE001 - an internal error of one output
+                        scope.fail(error)
+        finally:
+            INNERMOST.scope = outer
         if self._failures:
             for name, failure in list(self._failures.items()):
                 if name not in self._running and now_ns >= failure.due_ns:
