@@ -12,7 +12,7 @@ from imud.attitude.conventions import AttitudeSource, Convention, Heading
 from imud.attitude.published import FrameWords
 from imud.contracts.condition import DeviceCondition
 from imud.contracts.firmware import IMAGE_BYTES_MAX, PRODUCT_MAX
-from imud.contracts.status import CKernelStatus, DeviceState, DeviceStatus, MqttStatus, SocketStatus
+from imud.contracts.status import CKernelStatus, DeviceState, DeviceStatus, MqttStatus, OutputState, SocketStatus
 from imud.model.bucket import Bucket
 from imud.model.event import Event, StoredEvent
 from imud.model.sample import FieldInfo, Sample, Sync
@@ -162,6 +162,7 @@ class StatusResult(msgspec.Struct):
     configuration: str  # absolute path of the daemon's configuration file; empty without a file
     mqtt: list[MqttStatus]  # the output `mqtt`; empty if it does not run
     outputs: dict[str, str]  # problem of each output, or port of an output, that does not work
+    output_states: list[OutputState]  # each output that the configuration enables
     c_kernel: CKernelStatus
 
 
