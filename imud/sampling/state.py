@@ -8,7 +8,7 @@ Increment REVISION after a change of an algorithm in `imud.sampling` or in a cod
 a replay would continue with other results.
 """
 
-from math import isnan
+from math import hypot, isnan
 from typing import Any, Final
 
 import msgspec
@@ -24,6 +24,7 @@ from imud.formats.state import (
     Maybe,
     New,
     Present,
+    Real,
     Row,
     StateError,
     StateTable,
@@ -33,7 +34,7 @@ from imud.formats.state import (
 from imud.host.clock import PAIRS_MOST, SteadyTime
 from imud.model.sample import T_ERR_MOST, Position, Sample
 from imud.model.units import NS_PER_S
-from imud.sampling import arrival_fit, attitude, gaps
+from imud.sampling import arrival_fit, gaps
 from imud.sampling.aiding_state import AIDING, HOLDOVER, SLEW
 from imud.sampling.fit_state import (
     ARRIVAL_TIME,
@@ -186,7 +187,8 @@ CLOCK: Final = StateTable(
 
 
 class _FilterState:
-    """State of the filter of vqf: booleans, numbers, and lists of numbers, by the names of the installed version."""
+    """State of the filter of vqf: booleans, numbers, and lists of numbers, by the names of the installed version. The
+    library ends the process for a list of another length."""
 
     def save(self, value: Any, owner: Any) -> Any:
         """Return the state. None stands for NaN: a low-pass filter without a value."""
@@ -197,7 +199,10 @@ class _FilterState:
         new = owner.filter_state()
         if type(saved) is not dict or saved.keys() != new.keys():
             raise StateError("expected the state of an attitude filter of the installed vqf, got another state")
-        return {name: _filter_value(name, saved[name], item, owner) for name, item in new.items()}
+        state = {name: _filter_value(name, saved[name], item, owner) for name, item in new.items()}
+        for name in _ROTATIONS:
+            _expect_rotation(state.get(name))
+        return state
 
 
 def _without_nan(value: Any) -> Any:
@@ -215,25 +220,42 @@ def _filter_value(name: str, saved: Any, new: Any, owner: Any) -> Any:
         return Flag().load(saved, new, owner)
     if saved is None and _LOW_PASS in name:
         return float("nan")
-    return float(NUMBER.load(saved, new, owner))
+    return float(_FILTER_NUMBER.load(saved, new, owner))
 
 
+def _expect_rotation(quat: Any) -> None:
+    if quat is not None and not 1 - _NORM_ERROR < hypot(*quat) < 1 + _NORM_ERROR:
+        raise StateError("expected a quaternion of length 1")
+
+
+_FILTER_NUMBER: Final = Real(-1e12, 1e12)  # numbers, variances and counts of the filter
+# PERIOD_MAX_NS and BLOCK - 1 of `imud.sampling.attitude`, which a daemon without `attitude: host` does not import
+FILTER_PERIOD_MAX_NS: Final = NS_PER_S
+INTERVALS_MAX: Final = 31
+_ROTATIONS: Final = ("gyrQuat", "accQuat")  # names of quaternions
+_NORM_ERROR: Final = 0.01  # maximum error of the length of a quaternion
 _LOW_PASS: Final = "LpState"  # part of the names of low-pass filters, whose state starts with NaN
+
+
+def _finish_attitude(host_attitude: Any) -> None:
+    _expect_rotation(host_attitude._turn)
+    host_attitude.resume()
+
 
 ATTITUDE: Final = StateTable(
     (
-        Field(1, "_period_ns", Integer(1, attitude.PERIOD_MAX_NS)),
+        Field(1, "_period_ns", Integer(1, FILTER_PERIOD_MAX_NS)),
         Field(2, "_started_ns", TIME),
         Field(3, "_newest_ns", Maybe(TIME)),
-        Field(4, "_intervals_ns", Items(TIME, attitude.BLOCK - 1)),
+        Field(4, "_intervals_ns", Items(TIME, INTERVALS_MAX)),
         Field(5, "_settled", Flag()),
-        Field(6, "_bias", Row(NUMBER, NUMBER, NUMBER)),
-        Field(7, "_yaw_rad", NUMBER),
+        Field(6, "_bias", Row(_FILTER_NUMBER, _FILTER_NUMBER, _FILTER_NUMBER)),
+        Field(7, "_yaw_rad", _FILTER_NUMBER),
         Field(8, "_turn", Maybe(Row(NUMBER, NUMBER, NUMBER, NUMBER))),
         Field(9, "saved", _FilterState()),
     ),
     {"_array": CONSTRUCTOR, "_filter": "`saved`", "_from_up": CONSTRUCTOR, "_to_euler": CONSTRUCTOR},
-    lambda host_attitude: host_attitude.resume(),
+    _finish_attitude,
 )
 
 # --- paths -------------------------------------------------------------------------------------------------------

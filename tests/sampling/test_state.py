@@ -12,7 +12,18 @@ from imud.drivers import DRIVERS
 from imud.formats.state import New, StateError, StateTable, attribute_names, encode_state
 from imud.host.clock import SteadyTime
 from imud.model.errors import ImudError
-from imud.sampling.state import ATTITUDE, PATHS, REVISION, load_path, load_steady, save_path, save_steady
+from imud.sampling import attitude
+from imud.sampling.state import (
+    ATTITUDE,
+    FILTER_PERIOD_MAX_NS,
+    INTERVALS_MAX,
+    PATHS,
+    REVISION,
+    load_path,
+    load_steady,
+    save_path,
+    save_steady,
+)
 from tests.support import states
 from tests.support.states import BAD_VALUES, decoded, leaves, path_of, replaced, state_of
 
@@ -46,8 +57,12 @@ def test_each_object_has_a_complete_table() -> None:
             assert attribute_names(kind.make(None)) == kind.state.names
             made += 1
     assert made > 10
-    attitude = path_of("imu61x-spi", attitude=True).attitude
-    assert attribute_names(attitude) == ATTITUDE.names
+    host_attitude = path_of("imu61x-spi", attitude=True).attitude
+    assert attribute_names(host_attitude) == ATTITUDE.names
+
+
+def test_limits_of_the_attitude_are_equal() -> None:
+    assert (attitude.PERIOD_MAX_NS, attitude.BLOCK - 1) == (FILTER_PERIOD_MAX_NS, INTERVALS_MAX)
 
 
 def test_numbers_of_fields_are_unique() -> None:
