@@ -454,7 +454,6 @@ IMPORTERS = {
     "imud.contracts.registry": "the fixed rows of a registry",
     "imud.fleet.broker": "a constant",
     "imud.formats.kernel": "a constant",
-    "imud.publishers.signalk.server": "a constant",
     "imud.sampling.attitude": "a constant",
     "imud.sampling.path": "a constant",
 }
