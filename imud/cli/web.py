@@ -5,12 +5,13 @@ import asyncio
 import signal
 import socket
 import sys
-from time import time
+from time import monotonic_ns, thread_time_ns, time
 from typing import TYPE_CHECKING, Final
 
 from imud.cli.arguments import CliCommand, add_socket, check_port
 from imud.host.installation import needs_extra
 from imud.model.errors import BadArgument, LinkError, reason_of
+from imud.web.budgets import WebClock
 from imud.web.guard import WebGuard, is_loopback, read_token
 
 if TYPE_CHECKING:
@@ -53,7 +54,8 @@ def run(args: argparse.Namespace) -> int:
     guard = guard_of(args)
     with needs_extra("web"):
         from imud.web.server import WebServer
-    asyncio.run(_serve(WebServer(args.socket, guard), args))
+    clock = WebClock(monotonic_ns, thread_time_ns)
+    asyncio.run(_serve(WebServer(args.socket, guard, clock), args))
     return 0
 
 
@@ -75,7 +77,8 @@ def guard_of(args: argparse.Namespace) -> WebGuard:
 async def _serve(server: "WebServer", args: argparse.Namespace) -> None:
     from aiohttp import web
 
-    from imud.web.server import LimitedSite, server_log
+    from imud.web.connections import LimitedSite
+    from imud.web.server import server_log
 
     stopped = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -287,6 +287,10 @@ CONNECTIONS_MAX: Final = 32
 WAITING_MAX: Final = 64
 """Maximum number of connections without a complete request head. A new connection then closes the oldest of them."""
 READ_BYTES: Final = 65536
+VIEWER_BYTES: Final = 4096
+"""Maximum size of one read from a viewer, bytes. A viewer only sends its subscriptions, a few kB after its start."""
+VIEWER_PAUSE_S: Final = 0.05
+"""Pause after each read from a viewer, s: at most 80 kB/s of each viewer reach the server of foxglove-sdk."""
 GATHER_S: Final = 0.005
 """Pause after each read of messages, s. The server writes each message separately. A viewer draws every 16 ms."""
 NOTES_MAX: Final = 20
@@ -398,8 +402,8 @@ class ViewerGate:
         server_reader, server_writer = await asyncio.open_connection(*self._server, limit=READ_BYTES)
         server_writer.write(head)
         copies = (
-            asyncio.create_task(_forward(reader, server_writer, 0.0)),
-            asyncio.create_task(_forward(server_reader, writer, GATHER_S)),
+            asyncio.create_task(_forward(reader, server_writer, VIEWER_BYTES, VIEWER_PAUSE_S)),
+            asyncio.create_task(_forward(server_reader, writer, READ_BYTES, GATHER_S)),
         )
         try:
             await asyncio.wait(copies, return_when=asyncio.FIRST_COMPLETED)
@@ -410,9 +414,10 @@ class ViewerGate:
             await asyncio.gather(*copies, return_exceptions=True)
 
 
-async def _forward(reader: StreamReader, writer: StreamWriter, pause_s: float) -> None:
+async def _forward(reader: StreamReader, writer: StreamWriter, size_bytes: int, pause_s: float) -> None:
+    """Forward at most `size_bytes` in each `pause_s`. The kernel stops a faster sender."""
     with suppress(OSError):
-        while data := await reader.read(READ_BYTES):
+        while data := await reader.read(size_bytes):
             writer.write(data)
             await writer.drain()
             await asyncio.sleep(pause_s)

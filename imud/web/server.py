@@ -11,16 +11,16 @@ import asyncio
 import gzip
 import logging
 import re
-import socket
 import zlib
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Awaitable, Callable, Mapping
+from contextlib import suppress
+from functools import partial
 from pathlib import Path, PurePath
 from typing import Any, Final, NamedTuple
 
 import msgspec
-from aiohttp import WSMsgType, web
+from aiohttp import WSMessage, WSMsgType, web
 from aiohttp.http_exceptions import HttpProcessingError
 
 from imud import __version__
@@ -29,6 +29,18 @@ from imud.client.feed import Feed
 from imud.formats.jsonrpc import PROTOCOL, RpcError, encode_request, line_of, parse_object
 from imud.model.errors import ImudError, LinkDenied, LinkMissing, ServerError, reason_of
 from imud.web import messages
+from imud.web.budgets import (
+    OPEN_PAGES,
+    OPEN_REQUESTS,
+    TOKEN_PAGES,
+    TOKEN_REQUESTS,
+    MeasuredCall,
+    PageTurns,
+    RequestQueue,
+    WebBudget,
+    WebClock,
+)
+from imud.web.connections import MeteredProtocol, WebConnections
 from imud.web.guard import COOKIE, SESSION_S, WebGuard, WebRights, safety_headers
 from imud.web.hub import Browser, BrowserHub
 
@@ -142,12 +154,14 @@ CHECKS_TOTAL_MAX: Final = 64
 """Maximum number of tokens and cookies of all addresses that wait for a check."""
 BODY_S: Final = 10.0
 """Maximum time to receive the body of a POST, s."""
-CONNECTIONS_MAX: Final = 200
-"""Maximum number of connections, with open pages. A new connection then closes the connection that is idle longest."""
-IDLE_S: Final = 60.0
-"""Maximum time of a connection without a complete request, or to send a reply, s."""
-CHECK_S: Final = 1.0
-"""Time between two checks for idle connections, s."""
+OPEN_BROWSERS_MAX: Final = 48
+"""Maximum number of open pages without the token. The other places are for users with the token."""
+OPEN_CALLS_MAX: Final = 8
+"""Maximum number of concurrent requests to the daemon without the token."""
+DELAYS_MAX: Final = 100
+"""Delayed messages of a page minus other messages, after which imud names the page: one second of its budget."""
+SEND_S: Final = 10.0
+"""Maximum time to send the reply to a request to the daemon, s. The reply uses a place of AT_A_TIME_MAX."""
 BAD_INPUT: Final = (HttpProcessingError, web.RequestPayloadError)
 """Errors of aiohttp about malformed requests."""
 
@@ -204,136 +218,6 @@ def static_files() -> dict[str, StaticFile]:
     }  # fmt: skip
 
 
-class WebConnections:
-    """TCP connections of the server. Synchronization: one event loop.
-
-    aiohttp limits neither their number nor the time to send a request.
-    """
-
-    def __init__(self) -> None:
-        self._now_s = 0.0  # time of the newest check, s
-        # start of the connection, or end of its last request, oldest first
-        self._since_s: dict[web.RequestHandler, float] = {}
-        self._busy: set[web.RequestHandler] = set()
-        self._answering: set[web.RequestHandler] = set()  # connections whose request has no reply
-        self._half_closed: set[web.RequestHandler] = set()  # clients that closed their sending direction
-
-    def accept(self, connection: web.RequestHandler) -> web.RequestHandler:
-        """Add a new connection and return it. Close the oldest idle connection if there are too many."""
-        self._close(lambda idle_s: len(self._since_s) >= CONNECTIONS_MAX)
-        self._since_s[connection] = self._now_s
-        return connection
-
-    def close_idle(self) -> None:
-        """Close the connections that are idle for IDLE_S, and half-closed ones after the reply to their last request.
-
-        Call this method every CHECK_S.
-        """
-        self._now_s += CHECK_S
-        self._close(lambda idle_s: idle_s >= IDLE_S)
-        for connection in self._half_closed - self._busy - self._answering:
-            # two checks: the next of several requests can start between them
-            if connection.transport is not None and self._now_s - self._since_s.get(connection, 0.0) > CHECK_S:
-                connection.transport.close()  # sends the rest of the reply
-
-    def half_close(self, connection: web.RequestHandler) -> None:
-        """Note that the client of a connection sends no further requests, but can receive replies."""
-        self._half_closed.add(connection)
-
-    def remove(self, connection: web.RequestHandler) -> None:
-        """Remove a closed connection."""
-        self._since_s.pop(connection, None)
-        self._half_closed.discard(connection)
-        self._answering.discard(connection)
-
-    def _close(self, is_wanted: Callable[[float], bool]) -> None:
-        for connection, since_s in list(self._since_s.items()):
-            idle_s = self._now_s - since_s
-            transport = connection.transport
-            if transport is None and idle_s > CHECK_S:  # already closed; a new connection gets its transport soon
-                del self._since_s[connection]
-            elif transport is not None and connection not in self._busy and is_wanted(idle_s):
-                del self._since_s[connection]
-                transport.abort()
-
-    @contextmanager
-    def in_use(self, request: web.Request) -> Iterator[None]:
-        """Keep the connection of a request during a long reply."""
-        connection = request.protocol
-        self._busy.add(connection)
-        try:
-            yield
-        finally:
-            self._busy.discard(connection)
-
-    def begin_request(self, request: web.Request) -> None:
-        """Note that a connection has a request without a reply."""
-        self._answering.add(request.protocol)
-
-    def end_request(self, request: web.Request) -> None:
-        """Restart the idle time of a connection."""
-        self._answering.discard(request.protocol)
-        if self._since_s.pop(request.protocol, None) is not None:
-            self._since_s[request.protocol] = self._now_s
-
-    async def run(self, _app: web.Application) -> Any:
-        """Close idle connections while the application runs."""
-
-        async def check() -> None:
-            while True:
-                await asyncio.sleep(CHECK_S)
-                self.close_idle()
-
-        checking = asyncio.create_task(check())
-        yield
-        checking.cancel()
-
-
-class HalfCloseProtocol(asyncio.Protocol):
-    """Protocol of aiohttp for clients that can close their sending direction before they receive the reply.
-
-    asyncio closes the connection of such a client if `eof_received` does not return True.
-    """
-
-    def __init__(self, handler: web.RequestHandler, connections: WebConnections) -> None:
-        self._handler, self._connections = handler, connections
-        self.data_received = handler.data_received  # type: ignore[method-assign]  # one call less per read
-        self.pause_writing, self.resume_writing = handler.pause_writing, handler.resume_writing  # type: ignore[method-assign]
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._handler.connection_made(transport)
-
-    def eof_received(self) -> bool:
-        self._connections.half_close(self._handler)
-        return True
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        self._connections.remove(self._handler)
-        self._handler.connection_lost(exc)
-
-
-class LimitedSite(web.TCPSite):
-    """Listening socket whose connections are in a `WebConnections`."""
-
-    def __init__(self, runner: web.AppRunner, host: str, port: int, connections: WebConnections) -> None:
-        super().__init__(runner, host, port)
-        self._address, self._connections = (host, port), connections
-
-    async def start(self) -> None:
-        await web.BaseSite.start(self)
-        make = self._runner.server
-        assert make is not None
-        host, port = self._address
-        # asyncio does not report a family that the kernel lacks
-        socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET).close()
-        self._server = await asyncio.get_running_loop().create_server(
-            lambda: HalfCloseProtocol(self._connections.accept(make()), self._connections),
-            host,
-            port,
-            backlog=self._backlog,
-        )
-
-
 class _OfPrograms(logging.Filter):
     """Filter that keeps errors of imud, and discards errors about malformed requests and disconnected clients."""
 
@@ -382,18 +266,25 @@ class SecretChecks:
         return _refusal(401, "wrong token")
 
 
+PAGE_MESSAGES: Final = (WSMsgType.TEXT, WSMsgType.BINARY, WSMsgType.PING, WSMsgType.PONG)
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 class WebServer:
     """HTTP server for the daemon at `path`. aiohttp runs the application of `make_app`."""
 
-    def __init__(self, path: str, guard: WebGuard) -> None:
+    def __init__(self, path: str, guard: WebGuard, clock: WebClock) -> None:
         self._guard = guard
         self._calls = Calls(path)
         self._path = path
         self.checks = SecretChecks()
-        self.connections = WebConnections()
+        self.requests = {False: WebBudget(OPEN_REQUESTS, clock), True: WebBudget(TOKEN_REQUESTS, clock)}  # by token
+        self.pages = {False: PageTurns(WebBudget(OPEN_PAGES, clock)), True: PageTurns(WebBudget(TOKEN_PAGES, clock))}
+        self._queues = {has_token: RequestQueue(budget) for has_token, budget in self.requests.items()}
+        self._open_calls = 0  # number of concurrent requests to the daemon without the token
+        self._open_pages = 0  # number of pages without the token
+        self._page_number = 0  # number of the newest page
+        self.connections = WebConnections(self.requests[False])
         self.hub: BrowserHub | None = None  # the hub; None before the application runs
         self._files = static_files()
 
@@ -429,11 +320,23 @@ class WebServer:
         """Refuse malformed requests, and requests that another site could have sent."""
         self.connections.begin_request(request)
         try:
-            return await self._checked(request, handler)
+            return await self._measured(request, handler)
         except BAD_INPUT:
             return _refusal(400, "expected a valid HTTP request")
         finally:
             self.connections.end_request(request)
+
+    async def _measured(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Answer a request within the budget of its address."""
+        has_token = self._rights_of(request).control
+        peer = request.remote or ""
+        has_waited = await self._queues[has_token].wait(peer)
+        if request.path == "/api/stream":  # a page has a budget of its own
+            return await self._checked(request, handler)
+        response = await MeasuredCall(self.requests[has_token], peer, self._checked(request, handler))
+        if has_waited:
+            response.force_close()  # discards the requests that the client sent without waiting for the replies
+        return response
 
     async def _checked(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         headers = request.headers
@@ -501,24 +404,56 @@ class WebServer:
         assert self.hub is not None
         if not self._rights_of(request).read:
             return _refusal(401, "no permission; log in with the token")
+        has_token = self._rights_of(request).control
         if len(self.hub.browsers) >= BROWSERS_MAX:
             return _refusal(503, f"{BROWSERS_MAX} pages are open, the maximum; close one")
-        socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=LOOK_BYTES_MAX, compress=False)
+        if not has_token and self._open_pages >= OPEN_BROWSERS_MAX:
+            return _refusal(503, f"{OPEN_BROWSERS_MAX} pages without the token are open, the maximum; close one")
+        # the page replies to pings of the server; imud replies to pings of the page within its budget
+        socket = web.WebSocketResponse(
+            heartbeat=HEARTBEAT_S, max_msg_size=LOOK_BYTES_MAX, compress=False, autoping=False
+        )
         await socket.prepare(request)
         browser = Browser()
         self.hub.add(browser)
+        self._open_pages += not has_token
+        self._page_number += 1
+        page = f"page {self._page_number} of {request.remote}"
+        turns = self.pages[has_token]
         sending = asyncio.create_task(_send_all(browser, socket))
         try:
             with self.connections.in_use(request):
-                async for message in socket:
-                    if message.type is WSMsgType.TEXT:
-                        self._look(browser, message.data)
+                protocol = self.connections.protocol_of(request)
+                if protocol is not None:
+                    protocol.follow_page(page, turns.budget)
+                await MeasuredCall(turns.budget, page, self._read_page(browser, page, turns, socket, protocol))
         finally:
+            self._open_pages -= not has_token
             self.hub.remove(browser)
             sending.cancel()
             with suppress(asyncio.CancelledError):
                 await sending
         return socket
+
+    async def _read_page(
+        self, browser: Browser, page: str, turns: PageTurns, socket: web.WebSocketResponse,
+        protocol: MeteredProtocol | None,
+    ) -> None:  # fmt: skip
+        """Process the messages of a page until it closes."""
+        delays = 0  # number of delayed messages minus number of other messages
+        while (message := await _next_message(socket, protocol)).type in PAGE_MESSAGES:
+            is_delayed = await turns.process(page, partial(self._take, browser, message))
+            if message.type is WSMsgType.PING:
+                await socket.pong(message.data)
+            delays = max(0, delays + (1 if is_delayed else -1))
+            if delays == DELAYS_MAX:
+                turns.budget.report(page)
+                problem = messages.ProblemMessage("this page sends more than imud web processes; reload the page")
+                browser.mailbox.put_newest("problem", messages.encode(problem).decode())
+
+    def _take(self, browser: Browser, message: WSMessage) -> None:
+        if message.type is WSMsgType.TEXT:
+            self._look(browser, message.data)
 
     def _look(self, browser: Browser, text: str) -> None:
         assert self.hub is not None
@@ -540,7 +475,27 @@ class WebServer:
         if not (rights.control if is_control else rights.read):
             return _refusal(401, "no permission; log in with the token")
         with self.connections.in_use(request):
-            return await self._forwarded(asked)
+            if rights.control:
+                return await self._forwarded(asked)
+            return await self._forwarded_openly(request, asked)
+
+    async def _forwarded_openly(self, request: web.Request, asked: messages.CallRequest) -> web.StreamResponse:
+        """Forward a request without the token. A client that does not read its reply keeps its place for SEND_S."""
+        if self._open_calls >= OPEN_CALLS_MAX:
+            return _refusal(503, f"the limit of {OPEN_CALLS_MAX} concurrent requests without the token is reached; "
+                                 "try again later")  # fmt: skip
+        self._open_calls += 1
+        try:
+            response = await self._forwarded(asked)
+            async with asyncio.timeout(SEND_S):
+                await response.prepare(request)
+                await response.write_eof()
+        except TimeoutError:
+            if request.transport is not None:
+                request.transport.abort()
+        finally:
+            self._open_calls -= 1
+        return response
 
     async def _forwarded(self, asked: messages.CallRequest) -> web.Response:
         try:
@@ -560,6 +515,18 @@ async def _body(request: web.Request) -> bytes:
             return await request.read()
     except TimeoutError:
         raise web.HTTPRequestTimeout from None
+
+
+async def _next_message(socket: web.WebSocketResponse, protocol: MeteredProtocol | None) -> WSMessage:
+    """Return the next message of a page. Read from the connection only if no message is queued."""
+    receiving = asyncio.ensure_future(socket.receive())
+    try:
+        await asyncio.sleep(0)
+        if not receiving.done() and protocol is not None:
+            protocol.read_next(lambda: not receiving.done())
+        return await receiving
+    finally:
+        receiving.cancel()
 
 
 async def _send_all(browser: Browser, socket: web.WebSocketResponse) -> None:

@@ -13,8 +13,8 @@ import pytest
 from imud.cli import build_parser
 from imud.cli.web import _say, guard_of
 from imud.model.errors import BadArgument
+from imud.web.connections import CONNECTIONS_MAX
 from imud.web.guard import WebGuard
-from imud.web.server import CONNECTIONS_MAX
 from tests.cli.conftest import Cli, imud_process
 from tests.support.daemon_process import LIMIT_S
 

@@ -134,3 +134,12 @@ def test_debt_of_a_peer_is_one_second(budget: WorkBudget, cpu: Cpu) -> None:
     budget.start_turn(NS_PER_S * 11 // 10)
     assert not budget.is_spent
     assert budget.admit("a")
+
+
+def test_charge_of_measured_work(budget: WorkBudget) -> None:
+    budget.start_turn(0)
+    budget.charge("a", LIMITS.second_cpu_ns)
+    assert not budget.admit("a")
+    assert budget.admit("b")
+    budget.charge("b", EDGE_FACTOR * LIMITS.second_cpu_ns)
+    assert not budget.admit("c"), "the peers of the edge together"

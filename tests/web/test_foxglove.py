@@ -1,5 +1,6 @@
 """The relay between a daemon and a viewer: offered topics, messages, requests, and the gate in front."""
 
+import asyncio
 import gc
 import socket
 from collections.abc import Callable, Iterator
@@ -8,7 +9,7 @@ from pathlib import Path
 from queue import Queue
 from threading import Thread
 from typing import Any, NamedTuple
-from unittest.mock import patch
+from unittest.mock import AsyncMock, Mock, call, patch
 
 import msgspec
 import pytest
@@ -21,7 +22,7 @@ from imud.contracts.status import Deviations
 from imud.model.errors import ServerError
 from imud.model.event import Event, EventKind
 from imud.publishers.socket.server import SocketServer
-from imud.web.foxglove import Relay, ViewerGate, ViewerOrigins
+from imud.web.foxglove import VIEWER_BYTES, VIEWER_PAUSE_S, Relay, ViewerGate, ViewerOrigins, _forward
 from tests.support import socket_rig
 from tests.support.daemon_process import LIMIT_S, wait_until
 from tests.support.socket_rig import NOW_NS, batch, daemon
@@ -277,6 +278,23 @@ def test_a_viewer_comes_through_with_every_byte_in_both_directions(echo: Echo) -
         connection.sendall(b"close")
         assert connection.recv(1) == b"", "the end of the server is that of the viewer"
     assert echo.ended == 1
+
+
+def test_flood_of_viewer_is_slowed() -> None:
+    """The gate reads at most VIEWER_BYTES in each pause, so that a flood of subscriptions waits in the kernel."""
+
+    async def count() -> tuple[int, int]:
+        reader, writer = asyncio.StreamReader(), Mock(spec=asyncio.StreamWriter)
+        reader.feed_data(bytes(1_000_000))
+        reader.feed_eof()
+        sizes: list[int] = []
+        writer.write = lambda data: sizes.append(len(data))
+        with patch("asyncio.sleep", AsyncMock()) as pauses:
+            await _forward(reader, writer, VIEWER_BYTES, VIEWER_PAUSE_S)
+        assert pauses.await_args_list == [call(VIEWER_PAUSE_S)] * len(sizes)
+        return len(sizes), max(sizes)
+
+    assert asyncio.run(count()) == (-(-1_000_000 // VIEWER_BYTES), VIEWER_BYTES)
 
 
 def test_other_sites_and_programs_are_refused(echo: Echo) -> None:

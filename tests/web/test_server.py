@@ -9,6 +9,7 @@ import socket
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, closing
 from pathlib import Path
+from time import monotonic_ns, thread_time_ns
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock, call
@@ -22,24 +23,18 @@ from imud.formats.jsonrpc import Code, RpcError
 from imud.model.errors import ImudError, LinkMissing
 from imud.model.event import Event, EventKind
 from imud.publishers.socket.server import SocketServer
+from imud.web import connections as web_connections
 from imud.web import hub as mailbox
 from imud.web import server as web_app
+from imud.web.budgets import OPEN_REQUESTS, WebBudget, WebClock
+from imud.web.connections import LimitedSite, WebConnections
 from imud.web.guard import COOKIE, WebGuard
-from imud.web.server import (
-    STATIC,
-    Busy,
-    Calls,
-    LimitedSite,
-    WebConnections,
-    WebServer,
-    bundle,
-    server_log,
-    static_files,
-)
+from imud.web.server import STATIC, Busy, Calls, WebServer, bundle, server_log, static_files
 from tests.support import socket_rig
 from tests.support.socket_rig import batch, serving, until
 
 AT_A_TIME_MAX, CHECKS_MAX, CHECK_S, CONNECTIONS_MAX, FAILURES_MAX, IDLE_S = 16, 32, 1.0, 200, 8, 60.0
+CLOCK = WebClock(monotonic_ns, thread_time_ns)
 TOKEN = "correct-horse-battery-staple"
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
 
@@ -71,7 +66,9 @@ async def running(
     folder: Path, *, token: str = TOKEN, reading_needs_token: bool = False, small_buffers: bool = False
 ) -> AsyncIterator[Site]:
     async with serving(folder) as daemon:
-        web = WebServer(daemon.hub.path, WebGuard(token.encode(), lambda: 1e9, reading_needs_token=reading_needs_token))
+        web = WebServer(
+            daemon.hub.path, WebGuard(token.encode(), lambda: 1e9, reading_needs_token=reading_needs_token), CLOCK
+        )
         server = TestServer(web.make_app(), socket_factory=small_socket if small_buffers else get_port_socket)
         async with TestClient(server) as client:
             yield Site(web, client, daemon)
@@ -418,7 +415,7 @@ def connected(connections: WebConnections) -> tuple[FakeHandler, FakeTransport]:
 
 
 def test_idle_connections_are_closed_and_a_new_connection_replaces_the_oldest() -> None:
-    connections = WebConnections()
+    connections = WebConnections(WebBudget(OPEN_REQUESTS, CLOCK))
     (page, page_transport), *others = [connected(connections) for _ in range(CONNECTIONS_MAX)]
     with connections.in_use(SimpleNamespace(protocol=page)):  # type: ignore[arg-type]
         _, newest = connected(connections)
@@ -439,7 +436,7 @@ def test_idle_connections_are_closed_and_a_new_connection_replaces_the_oldest() 
 @asynccontextmanager
 async def listening(tmp_path: Path) -> AsyncIterator[tuple[str, int]]:
     """Run the server as the command does. Yield its address."""
-    web = WebServer(str(tmp_path / "none"), WebGuard(b"", lambda: 1e9, reading_needs_token=False))
+    web = WebServer(str(tmp_path / "none"), WebGuard(b"", lambda: 1e9, reading_needs_token=False), CLOCK)
     runner = AppRunner(web.make_app(), access_log=None, logger=server_log())
     await runner.setup()
     await LimitedSite(runner, "127.0.0.1", 0, web.connections).start()
@@ -469,7 +466,7 @@ async def test_bad_requests_make_no_log(tmp_path: Path, caplog: pytest.LogCaptur
 
 async def test_connections_without_a_complete_request_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("IDLE_S", "CHECK_S"):
-        monkeypatch.setattr(web_app, name, 0.01)
+        monkeypatch.setattr(web_connections, name, 0.01)
     async with listening(tmp_path) as (host, port):
         reader, writer = await asyncio.open_connection(host, port)
         assert await reader.read() == b""
