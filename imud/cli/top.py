@@ -28,6 +28,7 @@ from imud.model.errors import BadArgument
 from imud.model.event import Event
 from imud.model.ledger import lost
 from imud.model.sample import Sample, Vector3
+from imud.model.staleness import is_stale
 from imud.model.units import NS_PER_S, NS_PER_US, RAD_PER_DEG, T_PER_UT
 
 POINTS_MAX: Final = 1200  # maximum number of stored samples of a device: one minute at 20 Hz
@@ -84,6 +85,13 @@ class DeviceHistory:
     def newest(self) -> Sample | None:
         """Newest sample; None before the first sample."""
         return self._samples[-1] if self._samples else None
+
+    def current(self, now_ns: int) -> Sample | None:
+        """Return the newest sample; None if its values are not current, because no new sample arrives."""
+        newest = self.newest
+        rate_hz = self.status.expected_rate_hz or self.status.rate_hz
+        period_ns = round(NS_PER_S / rate_hz) if rate_hz > 0 else 0
+        return None if newest is None or is_stale(newest.t_rx_ns, now_ns, period_ns) else newest
 
     def add(self, sample: Sample) -> None:
         """Add a sample. Remove samples that are too old."""
@@ -189,23 +197,35 @@ def duration(seconds: float) -> str:
 
 def _angle(index: int) -> Callable[[DeviceHistory, int], Number]:
     def value(device: DeviceHistory, now_ns: int) -> Number:
-        newest = device.newest
+        newest = device.current(now_ns)
         return None if newest is None or newest.euler_rad is None else newest.euler_rad[index] / RAD_PER_DEG
 
     return value
 
 
 def _accel(device: DeviceHistory, now_ns: int) -> Number:
-    return None if device.newest is None else norm(device.newest.accel_m_s2)
+    current = device.current(now_ns)
+    return None if current is None else norm(current.accel_m_s2)
 
 
 def _turn_rate(device: DeviceHistory, now_ns: int) -> Number:
-    found = None if device.newest is None else norm(device.newest.gyro_rad_s)
+    current = device.current(now_ns)
+    found = None if current is None else norm(current.gyro_rad_s)
     return None if found is None else found / RAD_PER_DEG
 
 
 def _error_us(device: DeviceHistory, now_ns: int) -> Number:
-    return None if device.newest is None else device.newest.t_err_ns / NS_PER_US
+    current = device.current(now_ns)
+    return None if current is None else current.t_err_ns / NS_PER_US
+
+
+def _temperature_c(device: DeviceHistory, now_ns: int) -> Number:
+    return None if device.current(now_ns) is None else device.status.temperature_c
+
+
+def _sync(device: DeviceHistory, now_ns: int) -> str:
+    current = device.current(now_ns)
+    return "" if current is None else str(current.sync)
 
 
 def _counted(name: str) -> Callable[[DeviceHistory, int], Number]:
@@ -250,8 +270,8 @@ ERROR: Final = _number("±µs", 5, _error_us, _whole)
 SYNC: Final = OverviewColumn(
     "STAMP",
     5,
-    lambda device, now_ns: NONE if device.newest is None else str(device.newest.sync)[:5],
-    lambda device, now_ns: "" if device.newest is None else str(device.newest.sync),
+    lambda device, now_ns: _sync(device, now_ns)[:5] or NONE,
+    _sync,
     is_number=False,
 )
 
@@ -276,7 +296,7 @@ VIEWS: Final[dict[str, tuple[OverviewColumn, ...]]] = {
         _number("UNKN", 4, _counted("lost_unknown"), _whole),
         _number("CRC", 5, _counted("frames_bad_crc"), _whole),
         _number("OPENS", 5, lambda device, now_ns: device.status.connects, _whole),
-        _number("°C", 5, lambda device, now_ns: device.status.temperature_c, _tenths),
+        _number("°C", 5, _temperature_c, _tenths),
     ),
     "clock": (
         NAME, SYNC, ERROR,
@@ -603,6 +623,7 @@ class DevicePage(TopScreen):
 
     def _draw_curves(self, device: DeviceHistory | None) -> None:
         series = device.series() if device else []
+        has_value = device is not None and device.current(self.top.fleet.now_ns) is not None
         for index, _ in enumerate(CURVES):
             line = self.query_one(f"#curve{index}")
             values = series[index].values if series else []
@@ -610,7 +631,8 @@ class DevicePage(TopScreen):
             if values:
                 curve = series[index].curve
                 spread = f"{min(values):.2f} to {max(values):.2f}"
-                line.query_one(Label).update(f"{curve.name:<8}{values[-1]:9.2f} {curve.unit:<5}{spread}")
+                newest = f"{values[-1]:.2f}" if has_value else NONE
+                line.query_one(Label).update(f"{curve.name:<8}{newest:>9} {curve.unit:<5}{spread}")
                 line.query_one(Sparkline).data = values
 
     def _list_events(self) -> None:

@@ -109,8 +109,8 @@ class WorkBudget:
 
     def charge(self, peer: Hashable, spent_ns: int) -> None:
         """Charge CPU time that the caller has measured, for work that no turn contains."""
-        self._use(peer).cpu_ns -= spent_ns
-        self._edge.cpu_ns -= spent_ns
+        self._use(peer).charge(spent_ns)
+        self._edge.charge(spent_ns)
 
     def take_reply(self, peer: Hashable) -> bool:
         """Return whether imud may send one more reply to `peer` in this turn."""

@@ -17,11 +17,12 @@ import msgspec
 from imud.attitude.conventions import Convention
 from imud.bridges.status import rows
 from imud.client.feed import Feed, News, Wish
-from imud.contracts.status import LATENCY_BOUNDS_NS, DeviceStatus, RecentStatus
+from imud.contracts.status import LATENCY_BOUNDS_NS, DeviceState, DeviceStatus, RecentStatus
 from imud.model.bucket import VECTORS, Bucket, Range
 from imud.model.event import Event
 from imud.model.ledger import LEDGER_FIELDS, bytes_open, frames_open, lost
 from imud.model.sample import Sample
+from imud.model.staleness import is_stale
 from imud.model.units import NS_PER_S
 from imud.web import messages
 from imud.web.messages import Look, RawMessage
@@ -208,6 +209,7 @@ class BrowserHub:
         self._clients = 0
         self._buckets: dict[tuple[bool, str, int], Bucketing] = {}  # by comparison or not, device and rate
         self._newest: dict[str, Sample] = {}
+        self._arrival_ns: dict[str, int] = {}  # arrival of the newest sample of each device that a page shows
         # devices with samples for a page; for False without a comparison, for True in a comparison
         self._watched: dict[bool, tuple[str, ...]] = {False: (), True: ()}
 
@@ -304,12 +306,14 @@ class BrowserHub:
             before, self._statuses = self._statuses, {status.name: status for status in news.statuses}
             if news.hello is None:  # the first status of a connection can follow the previous status after hours
                 self._count_losses(before)
+            self._arrival_ns = {name: t_ns for name, t_ns in self._arrival_ns.items() if name in self._statuses}
             if before.keys() != self._statuses.keys():
                 self._want()  # a page can show a device that did not exist
             self._clients = news.clients
             self._spread_statuses(news.now_ns)
         if news.newest is not None:
             self._newest = {sample.device: sample for sample in news.newest}
+            self._arrival_ns |= {sample.device: sample.t_rx_ns for sample in news.newest}
         if news.statuses is not None or news.newest is not None:
             self._spread_overview(news.now_ns if news.newest is None else news.newest_ns)
         if news.events:
@@ -337,7 +341,7 @@ class BrowserHub:
 
     def _spread_statuses(self, now_ns: int) -> None:
         for name in {name for one in self.browsers for name in one.look.devices}:
-            message = status_message(name, self._statuses.get(name), now_ns)
+            message = status_message(name, self._statuses.get(name), now_ns, self._arrival_ns.get(name))
             self._to(lambda look, name=name: name in look.devices, message, f"status {name}")  # type: ignore[misc]  # bound now
 
     def _spread_overview(self, now_ns: int) -> None:
@@ -356,6 +360,7 @@ class BrowserHub:
         by_device: dict[str, list[Sample]] = {}
         for sample in news.samples:
             by_device.setdefault(sample.device, []).append(sample)
+            self._arrival_ns[sample.device] = sample.t_rx_ns
         for (kind, name, rate_hz), bucketing in self._buckets.items():
             if kind is not is_comparison:
                 continue
@@ -390,18 +395,36 @@ class BrowserHub:
                 browser.mailbox.put_newest("dropped", _text(messages.DroppedMessage(*dropped)))
 
 
-def status_message(name: str, status: DeviceStatus | None, now_ns: int) -> messages.StatusMessage:
-    """Return the message with the complete status of a device; with null if the device is not configured."""
+def has_stale_values(status: DeviceStatus, arrival_ns: int | None, now_ns: int) -> bool:
+    """Return whether the values of a device are not current. `arrival_ns` is the arrival of its newest sample."""
+    if arrival_ns is None:
+        return status.state is not DeviceState.RUNNING
+    rate_hz = status.expected_rate_hz or status.rate_hz
+    return is_stale(arrival_ns, now_ns, round(NS_PER_S / rate_hz) if rate_hz > 0 else 0)
+
+
+def status_message(
+    name: str, status: DeviceStatus | None, now_ns: int, arrival_ns: int | None = None
+) -> messages.StatusMessage:
+    """Return the message with the complete status of a device; with null if the device is not configured.
+
+    `arrival_ns` is the arrival of the newest sample; None if it is not known.
+    """
     bounds_s = tuple(bound / NS_PER_S for bound in LATENCY_BOUNDS_NS)
     if status is None:
         return messages.StatusMessage(name, now_ns / NS_PER_S, None, 0, 0, 0, bounds_s, ())
     ledger, whole = _counts(status), msgspec.to_builtins(status)
     opens = bytes_open(ledger), frames_open(ledger)
-    return messages.StatusMessage(name, now_ns / NS_PER_S, whole, lost(ledger), *opens, bounds_s, tuple(rows(status)))
+    return messages.StatusMessage(
+        name, now_ns / NS_PER_S, whole, lost(ledger), *opens, bounds_s, tuple(rows(status)),
+        has_stale_values(status, arrival_ns, now_ns),
+    )  # fmt: skip
 
 
 def row_of(status: DeviceStatus, newest: Sample | None, now_ns: int) -> messages.DeviceRow:
     condition, work, frame = status.condition, status.work, status.frame
+    is_stale_row = has_stale_values(status, None if newest is None else newest.t_rx_ns, now_ns)
+    current = None if is_stale_row else newest
     return messages.DeviceRow(
         name=status.name,
         state=status.word,
@@ -418,11 +441,11 @@ def row_of(status: DeviceStatus, newest: Sample | None, now_ns: int) -> messages
         expected_rate_hz=status.expected_rate_hz,
         lost=lost(_counts(status)),
         lost_percent=_lost_percent(status.recent),
-        temperature_c=status.temperature_c,
+        temperature_c=None if is_stale_row else status.temperature_c,
         age_s=None if newest is None else max(now_ns - newest.t_ns, 0) / NS_PER_S,
-        t_err_s=None if newest is None else newest.t_err_ns / NS_PER_S,
-        sync="" if newest is None else str(newest.sync),
-        euler_rad=None if newest is None else newest.euler_rad,
+        t_err_s=None if current is None else current.t_err_ns / NS_PER_S,
+        sync="" if current is None else str(current.sync),
+        euler_rad=None if current is None else current.euler_rad,
     )
 
 

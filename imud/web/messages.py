@@ -49,11 +49,11 @@ class DeviceRow(msgspec.Struct, frozen=True):
     expected_rate_hz: float
     lost: int
     lost_percent: float | None  # share of lost samples in the last minute; null without samples
-    temperature_c: float | None
+    temperature_c: float | None  # null if the values are not current
     age_s: float | None  # age of the newest sample; null before the first sample
-    t_err_s: float | None
+    t_err_s: float | None  # null if the values are not current
     sync: str
-    euler_rad: tuple[float, ...] | None
+    euler_rad: tuple[float, ...] | None  # null if the values are not current
 
 
 class OverviewMessage(ToPage, frozen=True, tag="overview"):
@@ -75,6 +75,7 @@ class StatusMessage(ToPage, frozen=True, tag="status"):
     frames_open: int  # 0 if the ledger balances
     latency_bounds_s: tuple[float, ...]
     rows: tuple[tuple[str, str], ...]  # name and text, as `imud status` prints them
+    is_stale: bool = False  # whether the values of the device are not current, because no new sample arrives
 
 
 class SamplesMessage(ToPage, frozen=True, tag="samples"):

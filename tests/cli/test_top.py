@@ -351,3 +351,19 @@ def test_ages_order_and_filter() -> None:
         "hi13 /dev": ["bow", "stern"], "power": ["stern"],
     }.items():  # fmt: skip
         assert names(top.chosen(devices, top.NAME, NOW_NS, words=words)) == found, words
+
+
+def test_old_values_are_not_shown() -> None:
+    history = top.DeviceHistory(device("bow"))
+    history.add(msgspec.structs.replace(sample("bow"), euler_rad=(0.5, -0.25, 3.0)))
+    arrival_ns = sample("bow").t_rx_ns
+    values = {}
+    for now_ns in (arrival_ns, arrival_ns + NS_PER_S, arrival_ns + NS_PER_S + 1):
+        texts = {column.title: column.text(history, now_ns).strip() for columns in top.VIEWS.values()
+                 for column in columns}  # fmt: skip
+        values[now_ns] = [texts[title] for title in ("ROLL°", "PITCH°", "YAW°", "|a|", "|ω|°", "±µs", "°C", "STAMP")]
+        assert texts["AGE"] != top.NONE
+    current, limit, old = values.values()
+    assert current == limit
+    assert top.NONE not in current
+    assert set(old) == {top.NONE}

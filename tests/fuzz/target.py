@@ -45,7 +45,7 @@ GROUPS: Final = {
     "mqtt": "tests.fuzz.broker", "fleet": "tests.fuzz.fleet", "command": "tests.fuzz.commands",
     "ros2": "tests.fuzz.dds", "influx": "tests.fuzz.influx", "state": "tests.fuzz.state",
     "client": "tests.fuzz.answers", "firmware": "tests.fuzz.firmware", "peer": "tests.fuzz.peers",
-    "node": "tests.fuzz.nodes",
+    "node": "tests.fuzz.nodes", "page": "tests.fuzz.page",
 }  # fmt: skip
 """Module of each group. `names` returns the names of its targets. `make` makes a target and imports the tested code, so
 that only the code of this target is instrumented."""

@@ -57,6 +57,29 @@ def expected(member: str, axis: int, spans: Sequence[tuple[int, int]]) -> Rows:
     return np.array(found)
 
 
+ANGLES_SHOWN = "[...document.querySelectorAll('#attitude3d output')].map((one) => one.textContent)"
+TEMPERATURE_SHOWN = """[...document.querySelectorAll('#live .bigs div')].find((one) =>
+    one.querySelector('dt').textContent === 'Temperature').querySelector('b').textContent"""
+
+
+def test_values_disappear_without_new_samples(page: Page, tmp_path: Path) -> None:
+    """If a device falls silent, no number and no attitude of its last sample stays on the page."""
+    with cable(tmp_path) as port, sent_by(tmp_path, port) as daemon, serving_web(daemon.socket) as url:
+        with Sender(port, ramps):
+            daemon.wait_for("bow", "running")
+            open_page(page, url, "bow")
+            page.until("return window.imud.view.live.attitude.quaternion !== null", what="an attitude")
+            page.until(f"return {ANGLES_SHOWN}.every((one) => one.endsWith('°'))", what="three angles")
+            page.until(f"return {TEMPERATURE_SHOWN} === '20.0'", what="the temperature")
+        page.until(f"return {ANGLES_SHOWN}.every((one) => one === '–')", what="no angle")
+        page.until(f"return {TEMPERATURE_SHOWN} === '–'", what="no temperature")
+        assert page.js("return window.imud.view.live.attitude.quaternion") is None
+        with Sender(port, ramps):
+            page.until(f"return {ANGLES_SHOWN}.every((one) => one.endsWith('°'))", what="three angles again")
+            page.until("return window.imud.view.live.attitude.quaternion !== null", what="the attitude again")
+        assert page.problems() == []
+
+
 def test_every_vector_and_angle_is_plotted_as_it_was_sent_in_the_units_of_people(page: Page, tmp_path: Path) -> None:
     with cable(tmp_path) as port, Sender(port, ramps), sent_by(tmp_path, port) as daemon:
         daemon.wait_for("bow", "running")

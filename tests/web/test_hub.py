@@ -13,6 +13,7 @@ from imud.client.feed import Feed, News, Wish
 from imud.contracts.status import DeviceState
 from imud.model.event import Event, EventKind
 from imud.model.sample import Sample
+from imud.model.units import NS_PER_S
 from imud.web.hub import Browser, BrowserHub, Bucketing, Mailbox, bucket_of, raw_of, row_of, status_message
 from imud.web.messages import Look
 from tests.support.metrics import device
@@ -309,3 +310,30 @@ async def test_messages_wait_in_order_and_are_dropped_or_forgotten() -> None:
     mailbox.acknowledge(-5)
     mailbox.put("and one")
     assert await mailbox.take() == "and one"
+
+
+def test_values_without_new_samples_are_not_current() -> None:
+    """Three periods of 1 Hz are 3 s. The minimum is 1 s, also for 1 kHz."""
+    slow, fast = device("bow", expected_rate_hz=1.0), device("bow", expected_rate_hz=1000.0)
+    newest = msgspec.structs.replace(sample("bow"), euler_rad=(0.5, 0.0, 0.0))
+    for status, limit_ns in ((slow, 3 * NS_PER_S), (fast, NS_PER_S)):
+        current = row_of(status, newest, newest.t_rx_ns + limit_ns)
+        assert (current.euler_rad, current.temperature_c) == ((0.5, 0.0, 0.0), status.temperature_c)
+        stale = row_of(status, newest, newest.t_rx_ns + limit_ns + 1)
+        assert (stale.euler_rad, stale.temperature_c, stale.t_err_s, stale.sync) == (None, None, None, "")
+        assert stale.age_s is not None
+        for late_ns, is_stale in ((0, False), (1, True)):
+            now_ns = newest.t_rx_ns + limit_ns + late_ns
+            assert status_message("bow", status, now_ns, newest.t_rx_ns).is_stale is is_stale
+    assert status_message("bow", device("bow", state=DeviceState.SILENT), 0).is_stale
+    assert not status_message("bow", device("bow"), 0).is_stale, "no page has requested samples yet"
+
+
+async def test_page_gets_the_arrival_of_its_samples() -> None:
+    hub, _ = make()
+    browser = opened(hub, look="device", device="bow", rate_hz=50)
+    hub.spread(news(statuses=(device("bow"),)))
+    assert [one["is_stale"] for one in await heard(browser, "status")] == [False]
+    later_ns = sample("bow").t_rx_ns + 2 * NS_PER_S
+    hub.spread(News(statuses=(device("bow"),), now_ns=later_ns))
+    assert [one["is_stale"] for one in await heard(browser, "status")] == [True]

@@ -38,6 +38,13 @@ export class AttitudeView {
     this.draw();
   }
 
+  /** Remove the block: the attitude is not known now. */
+  clear() {
+    if (!this.quaternion) return;
+    this.quaternion = null;
+    this.draw();
+  }
+
   /** Return a vector of the device in east, north, up. */
   toEnu(vector) {
     const [a, b, c] = rotate(this.quaternion, vector);

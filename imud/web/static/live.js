@@ -117,7 +117,10 @@ export class LiveSection {
     if (!this.group.isPaused) this.spectrum.add(message);
   }
 
-  draw({ status }) {
+  draw({ status, is_stale }) {
+    this.isStale = is_stale;
+    this.node.classList.toggle("stale-values", is_stale);
+    if (is_stale) this.removeValues();
     this.frame = status.navigation_frame || "ENU";
     this.group.rate_hz = status.expected_rate_hz;
     const heading = status.frame?.heading;
@@ -127,6 +130,12 @@ export class LiveSection {
     setText(this.axes, status.frame ? `Axes: ${status.frame.frame}` : "");
     if (!this.attitude.quaternion) this.attitude.draw();
     this.drawFigures(status);
+  }
+
+  /** Remove the values of the last sample: no new sample arrives. */
+  removeValues() {
+    for (const { value } of this.angles) setText(value, "–");
+    this.attitude.clear();
   }
 
   drawFigures(status) {
@@ -139,11 +148,13 @@ export class LiveSection {
     const codes = (status.condition?.reasons ?? []).map((one) => one.code);
     const [error, errorUnit = ""] = duration(clock.t_err_ns / 1e9).split(" ");
     const [mean, meanUnit = ""] = duration(count ? status.latency_sum_ns / 1e9 / count : null).split(" ");
+    const isOld = this.isStale;
     set("Rate", number(status.rate_hz, 1), status.expected_rate_hz ? `of ${number(status.expected_rate_hz, Math.abs(status.expected_rate_hz % 1) < 0.05 ? 0 : 1)} Hz` : "Hz", codes.includes("rate"));
     set("Lost in last minute", share === null ? "" : percent(share), share === null ? "" : "%", codes.includes("lost"));
-    set("Time stamp error", `±${error}`, errorUnit, codes.includes("time-error"));
-    set("Latency", mean, meanUnit);
-    set("Temperature", status.temperature_c === null ? "" : number(status.temperature_c, 1), status.temperature_c === null ? "not sent" : "°C");
+    set("Time stamp error", isOld ? "–" : `±${error}`, isOld ? "" : errorUnit, codes.includes("time-error"));
+    set("Latency", isOld ? "–" : mean, isOld ? "" : meanUnit);
+    if (isOld) set("Temperature", "–", "");
+    else set("Temperature", status.temperature_c === null ? "" : number(status.temperature_c, 1), status.temperature_c === null ? "not sent" : "°C");
   }
 
   redraw() {
