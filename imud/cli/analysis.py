@@ -8,11 +8,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
-import msgspec
-
 from imud.cli.arguments import CliCommand, add_driver, add_duration, add_interface, add_option, add_socket, duration_s
 from imud.cli.output import complain
 from imud.host.installation import needs_extra
+from imud.host.log import printable_json
 from imud.model.errors import BadArgument
 
 BAND: Final = re.compile(r"(\d+(?:\.\d*)?)-(\d+(?:\.\d*)?)")
@@ -133,7 +132,7 @@ def take(args: argparse.Namespace) -> Any:
 def show(args: argparse.Namespace, report: Any, module: Any) -> int:
     """Print a report. Return the exit status."""
     text: Callable[[Any], str] = module.text
-    print(msgspec.json.encode(module.as_object(report)).decode() if args.json else text(report))
+    print(printable_json(module.as_object(report)) if args.json else text(report))
     return 0
 
 

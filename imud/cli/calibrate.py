@@ -6,13 +6,12 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from typing import Final, TextIO
 
-import msgspec
-
 from imud.cli.arguments import CliCommand, add_socket
 from imud.cli.output import local_time, table
 from imud.client.connection import Client, decoded
 from imud.contracts.command import CalibrationInfo, CalibrationResult, Handling, Kept
 from imud.contracts.setting import SAVE_SENT
+from imud.host.log import printable_json
 from imud.model.errors import BadArgument
 from imud.model.event import Event, EventKind
 from imud.model.units import RAD_PER_DEG, T_PER_UT
@@ -57,7 +56,7 @@ def calibrate(args: argparse.Namespace) -> int:
             print("imud changed nothing")
             return 1
         result = _follow(args, watching)
-    print(msgspec.json.encode(result).decode() if args.json else _account(result, asked_to_save=args.save))
+    print(printable_json(result) if args.json else _account(result, asked_to_save=args.save))
     return 0 if result.verified else 1
 
 
@@ -111,7 +110,7 @@ def _show(event: Event, out: TextIO, *, as_json: bool) -> None:
     if event.kind is not EventKind.CALIBRATION:
         return
     if as_json:
-        print(msgspec.json.encode(event).decode(), file=out, flush=True)
+        print(printable_json(event), file=out, flush=True)
     elif out.isatty():
         out.write(CLEAR_LINE + progress_line(event))
         out.flush()

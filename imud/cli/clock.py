@@ -8,12 +8,11 @@ from contextlib import suppress
 from time import monotonic
 from typing import Final
 
-import msgspec
-
 from imud.cli.arguments import CliCommand, add_duration, add_socket, connect, statuses
 from imud.cli.output import histogram, paragraph
 from imud.client.connection import Client
 from imud.contracts.status import ClockStatus, DeviceStatus
+from imud.host.log import printable_json
 from imud.model.errors import ImudError
 from imud.model.sample import Sync
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US
@@ -54,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
             raise ImudError("the daemon has no device; configure the attached devices with `imud setup`")
         if args.json:
             clocks = {status.name: status.clock for status in statuses(asking) if status.name in chosen}
-            print(msgspec.json.encode(clocks).decode())
+            print(printable_json(clocks))
             return 0
         behind: dict[str, deque[int]] = {name: deque(maxlen=KEPT) for name in chosen}
         with connect(args) as listening:

@@ -11,8 +11,6 @@ import sys
 from collections.abc import Iterator
 from typing import BinaryIO
 
-import msgspec
-
 from imud.cli.arguments import (
     CliCommand,
     add_driver,
@@ -29,6 +27,7 @@ from imud.drivers import DRIVERS
 from imud.formats.can import CandumpReader
 from imud.formats.capture import CaptureReader
 from imud.host.files import NotRegularFile, open_stream
+from imud.host.log import printable_json
 from imud.model.errors import ImudError
 from imud.model.ledger import Ledger
 from imud.model.options import Options
@@ -61,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     sys.stdout.flush()
     shown = {name: value for name, value in ledger.snapshot().items() if value}
     # standard error: standard output contains only JSON lines
-    print(msgspec.json.encode(shown).decode(), file=sys.stderr)
+    print(printable_json(shown), file=sys.stderr)
     return 0 if ledger.frames_in_samples or (ledger.frames_in_replies and not ledger.frames_ignored) else 1
 
 
@@ -84,7 +83,7 @@ def decode(
     """
     times = UnwrappedTime(driver)
     for event in events_in(file, driver, ledger, settings or driver.settings(), interface):
-        yield msgspec.json.encode(as_object(event, times)).decode() + "\n"
+        yield printable_json(as_object(event, times)) + "\n"
 
 
 def events_in(

@@ -3,13 +3,12 @@
 import argparse
 from typing import Any, Final
 
-import msgspec
-
 from imud.cli.arguments import CliCommand, add_socket, confirmed, connect, named_values, statuses
 from imud.cli.output import table, terminal_width
 from imud.client.connection import Client, decoded
 from imud.contracts.command import VerbInfo
 from imud.contracts.condition import Condition
+from imud.host.log import printable_json
 
 HEAD: Final = ("DEVICE", "CONDITION", "RATE HZ", "DRIVER", "PRODUCT", "SERIAL NUMBER", "LINK")
 LIMIT_S: Final = 180.0  # Time limit of a command, s. The longest command, a calibration, ends within two minutes.
@@ -62,9 +61,9 @@ def command(args: argparse.Namespace) -> int:
 def _verb_words(answer: Any) -> str:
     """Format the result of a verb: evidence for its effect, and its values."""
     if not isinstance(answer, dict) or not {"verified", "evidence"} <= answer.keys():
-        return msgspec.json.encode(answer).decode() if answer is not None else "done"
+        return printable_json(answer) if answer is not None else "done"
     lines = [f"{'verified' if answer['verified'] else 'sent, not verified'}: {answer['evidence']}"]
-    lines += [] if answer["result"] is None else [msgspec.json.encode(answer["result"]).decode()]
+    lines += [] if answer["result"] is None else [printable_json(answer["result"])]
     return "\n".join([*lines, *filter(None, [answer["not_saved"]])])
 
 

@@ -21,7 +21,7 @@ from imud.client.connection import Client, decoded
 from imud.client.feed import clock_ahead_ns, utc_offset_ns
 from imud.contracts.condition import DeviceCondition, signature
 from imud.contracts.condition import duration as in_words
-from imud.host.log import MESSAGE_CHARACTERS_MAX, printable
+from imud.host.log import MESSAGE_CHARACTERS_MAX, printable, printable_json
 from imud.model.errors import LinkMissing, ServerError
 from imud.model.event import LEVELS, Event, StoredEvent
 from imud.model.units import NS_PER_S
@@ -228,7 +228,7 @@ def as_text(event: PrintedEvent) -> str:
 
 def as_json(event: PrintedEvent) -> str:
     """Format an event as one JSON object."""
-    return msgspec.json.encode(event).decode()
+    return printable_json(event)
 
 
 EVENTS = CliCommand(add_arguments, run)

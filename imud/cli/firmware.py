@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Final, TextIO
 from zlib import crc32
 
-import msgspec
 from intelhex import IntelHex, IntelHexError
 
 from imud.cli.arguments import CliCommand, add_socket
 from imud.client.connection import Client, decoded
 from imud.contracts.firmware import IMAGE_BYTES_MAX, TOTAL_S, FirmwareImage, FirmwareResult
 from imud.host.files import read_regular
+from imud.host.log import printable_json
 from imud.model.errors import BadArgument, reason_of
 from imud.model.event import Event, EventKind
 
@@ -53,7 +53,7 @@ def firmware(args: argparse.Namespace) -> int:
         return 1
     with Client(args.socket) as watching:
         result = _follow(args, image, watching)
-    print(msgspec.json.encode(result).decode() if args.json else _account(result))
+    print(printable_json(result) if args.json else _account(result))
     return 0 if result.verified else 1
 
 
@@ -143,7 +143,7 @@ def _show(event: Event, out: TextIO, *, as_json: bool) -> None:
         return
     progress = event.detail.get("progress")
     if as_json:
-        print(msgspec.json.encode(event).decode(), file=out, flush=True)
+        print(printable_json(event), file=out, flush=True)
     elif out.isatty() and isinstance(progress, float) and event.detail.get("phase") != "end":
         filled = int(progress * BAR)
         out.write(f"{CLEAR_LINE}[{'#' * filled}{'.' * (BAR - filled)}] {progress:4.0%}  {event.message}")

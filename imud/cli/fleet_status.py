@@ -20,7 +20,7 @@ from imud.fleet.database.overview import (
     RejectedCounts,
     RejectedMessage,
 )
-from imud.host.log import printable
+from imud.host.log import printable, printable_json
 from imud.model.errors import BadArgument
 
 ROWS_MAX: Final = 100  # Maximum number of rows of a table without --all. A terminal cannot show more of them together.
@@ -90,7 +90,7 @@ def run_status(args: argparse.Namespace) -> int:
         summary = reader.summary(selection)
         rows = reader.gateways(selection, problems=args.problems, absent=args.silent_only, limit=limit)
     report = FleetReport(rows, summary)
-    print(msgspec.json.encode(report).decode() if args.json else status_page(report, _matching(summary, args)))
+    print(printable_json(report) if args.json else status_page(report, _matching(summary, args)))
     return 1 if summary.with_problem or not summary.gateways else 0
 
 
@@ -147,7 +147,7 @@ def run_rejected(args: argparse.Namespace) -> int:
             return 0
         messages, counts = reader.rejected(args.gateway, args.since, None if args.all or args.json else ROWS_MAX)
     if args.json:
-        print(msgspec.json.encode(RejectedReport(messages, *counts)).decode())
+        print(printable_json(RejectedReport(messages, *counts)))
     else:
         print(rejected_page(messages, counts))
     return 0

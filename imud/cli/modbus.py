@@ -30,6 +30,7 @@ from imud.drivers.hipnuc.modbus.registers import (
     set_id_by_serial,
 )
 from imud.formats.modbus import BROADCAST, SLAVES
+from imud.host.log import printable_json
 from imud.links.rs485 import Rs485Link, Rs485Options
 from imud.model.errors import BadArgument, CommandError, DeviceRefused, TransferError
 
@@ -277,7 +278,7 @@ def _baud(text: str) -> int:
 def _show(found: list[FoundModule], *, as_json: bool) -> None:
     if as_json:
         for one in found:
-            print(msgspec.json.encode(one).decode())
+            print(printable_json(one))
     elif found:
         rows = [
             (one.baud, one.address, one.product or "-", one.serial_number or "-", one.firmware or "-", one.problem)

@@ -25,6 +25,7 @@ from imud.device.stream_search import StreamFound, StreamRound
 from imud.drivers import DRIVERS
 from imud.formats.can import CanFrame
 from imud.host.clock import HostClock
+from imud.host.log import printable_json
 from imud.host.netlink import can_details, can_interfaces
 from imud.links import LINKS
 from imud.links.serial_port import list_ports
@@ -174,7 +175,7 @@ def run(args: argparse.Namespace) -> int:
     reports = asyncio.run(examine_all(list(dict.fromkeys(chosen)), set(args.active), titles))
     if args.json:
         for report in reports:
-            print(msgspec.json.encode(report).decode())
+            print(printable_json(report))
     elif reports:
         print("\n".join(map(block, reports)))
     else:

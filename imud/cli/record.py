@@ -18,8 +18,6 @@ from time import monotonic
 from types import FrameType
 from typing import Any, BinaryIO, Final
 
-import msgspec
-
 from imud.cli.arguments import CliCommand, add_duration, add_socket, connect
 from imud.cli.output import discard_output, paragraph
 from imud.client.connection import Client
@@ -36,6 +34,7 @@ from imud.formats.records import (
     decode_object,
 )
 from imud.host.files import open_regular
+from imud.host.log import printable_json
 from imud.model.errors import BadArgument, ImudError, reason_of
 from imud.model.ledger import LOST_FIELDS, lost
 from imud.model.units import NS_PER_S
@@ -186,7 +185,7 @@ def run_info(args: argparse.Namespace) -> int:
     except OSError as error:
         raise ImudError(f"cannot read {args.file}: {error.strerror}") from error
     report = summary(contents, reader)
-    print(msgspec.json.encode(report).decode() if args.json else page(report))
+    print(printable_json(report) if args.json else page(report))
     return 1 if report["damage"] or report["records_dropped"] else 0
 
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import BinaryIO, Final
 
-import msgspec
 from msgspec.structs import replace
 
 from imud import config
@@ -33,7 +32,7 @@ from imud.formats.capture import CaptureReader
 from imud.formats.recording import MAGIC, RecordingReader, is_recording
 from imud.host import event_loop
 from imud.host.files import open_regular
-from imud.host.log import STDERR, log_to
+from imud.host.log import STDERR, log_to, printable_json
 from imud.links import LINKS
 from imud.model.errors import BadArgument, ImudError
 from imud.model.event import Event
@@ -81,7 +80,7 @@ def _play(file: BinaryIO, args: argparse.Namespace) -> int:
 
 def print_samples(batch: Batch) -> None:
     """Print one JSON line per sample. Raises OSError if writing fails."""
-    print("".join(msgspec.json.encode(sample).decode() + "\n" for sample in batch.samples), end="")
+    print("".join(printable_json(sample) + "\n" for sample in batch.samples), end="")
 
 
 def play_to_end(file: BinaryIO, name: str, player: Player) -> tuple[str, int]:
@@ -176,7 +175,7 @@ class Printer:
 
     def publish(self, batch: Batch) -> None:
         """Print one line per sample."""
-        self._output("".join(msgspec.json.encode(sample).decode() + "\n" for sample in batch.samples))
+        self._output("".join(printable_json(sample) + "\n" for sample in batch.samples))
 
     def close(self) -> None:
         """Flush the output."""
@@ -334,7 +333,7 @@ def configuration(args: argparse.Namespace) -> str:
             }
         },
     }
-    return msgspec.json.encode(tree).decode()
+    return printable_json(tree)
 
 
 REPLAY = CliCommand(add_arguments, run)

@@ -3,13 +3,12 @@
 import argparse
 from typing import Final, NamedTuple
 
-import msgspec
-
 from imud.attitude.conventions import AttitudeSource
 from imud.cli.arguments import CliCommand
 from imud.cli.output import table
 from imud.contracts.driver import Driver, status_bits_of
 from imud.drivers import DRIVERS
+from imud.host.log import printable_json
 from imud.model.sample import SAMPLE_SCHEMA
 
 FIELD_HEAD: Final = ("FIELD", "TYPE", "UNIT", "FRAME", "MEANING")
@@ -35,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     drivers = driver_schemas()
     if args.json:
         objects = {name: one._asdict() for name, one in drivers.items()}
-        print(msgspec.json.encode({"fields": SAMPLE_SCHEMA, "drivers": objects}).decode())
+        print(printable_json({"fields": SAMPLE_SCHEMA, "drivers": objects}))
     else:
         print(page(drivers))
     return 0

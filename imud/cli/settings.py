@@ -7,8 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import msgspec
-
 from imud.bridges.status import times
 from imud.cli.arguments import CliCommand, add_socket, confirmed, named_values
 from imud.cli.output import table, terminal_width
@@ -18,6 +16,7 @@ from imud.contracts.setting import AppliedSettings, SettingInfo, SettingsPlan, S
 from imud.device.flash import backup_text
 from imud.formats.jsonrpc import Code, RpcError
 from imud.host.files import read_regular, replace_file
+from imud.host.log import printable_json
 from imud.model.errors import BadArgument
 
 HEAD: Final = ("SETTING", "DECLARED", "ACTUAL", "")
@@ -69,7 +68,7 @@ def settings(args: argparse.Namespace) -> int:
         return 0
     if args.backup is not None:
         return _back_up(report, args)
-    print(msgspec.json.encode(report).decode() if args.json else _shown(report, verbose=args.verbose))
+    print(printable_json(report) if args.json else _shown(report, verbose=args.verbose))
     return 1 if report.status.state in (SettingsState.DIFFER, SettingsState.UNKNOWN) else 0
 
 
@@ -250,12 +249,12 @@ def _change(client: Client, args: argparse.Namespace, given: Mapping[str, Any] |
         print(_planned(plan))
     if plan.empty:
         if args.json:
-            print(msgspec.json.encode(AppliedSettings(left_out=plan.left_out)).decode())
+            print(printable_json(AppliedSettings(left_out=plan.left_out)))
         return 1 if plan.left_out else 0
     if plan.risk and not confirmed(f"change {args.device}", plan.risk, yes=args.yes):
         return 1
     done = decoded(client.call("settings.apply", **params), AppliedSettings, "settings.apply")
-    print(msgspec.json.encode(done).decode() if args.json else _account(done))
+    print(printable_json(done) if args.json else _account(done))
     # also 1 if the device did not keep a value
     return 1 if done.failure else 0
 

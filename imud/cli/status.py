@@ -11,6 +11,7 @@ from imud.cli.arguments import CliCommand, add_socket, connect
 from imud.cli.output import paragraph
 from imud.client.connection import decoded
 from imud.contracts.status import CKernelStatus, DeviceStatus, MqttStatus
+from imud.host.log import printable_json
 from imud.model.errors import BadArgument
 from imud.model.options import unknown_name
 
@@ -41,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
         answer = {**answer, "devices": [one for one in answer["devices"] if one["name"] in args.device]}
     reply = decoded(answer, _Reply)
     if args.json:
-        print(msgspec.json.encode(answer).decode())
+        print(printable_json(answer))
     else:
         print(page(reply.devices, reply.mqtt, reply.outputs, reply.c_kernel))
     return 1 if any(device.has_problem for device in reply.devices) else 0

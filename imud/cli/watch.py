@@ -9,15 +9,13 @@ from collections.abc import Callable, Iterable, Sequence
 from time import monotonic
 from typing import Any, Final, NamedTuple, Protocol
 
-import msgspec
-
 from imud.attitude.conventions import Convention
 from imud.bridges.csv import sample_columns, sample_row
 from imud.cli.arguments import CliCommand, add_socket, chosen_fields, finite
 from imud.cli.events import LOOK_S, DeviceNotes, keep_connected
 from imud.cli.output import COLUMNS, fitted, local_time, raise_if_unread, shortened
 from imud.client.connection import Client
-from imud.host.log import printable
+from imud.host.log import printable, printable_json
 from imud.model.sample import SAMPLE_FIELDS, Position, Sample, values_of
 from imud.model.units import NS_PER_MS, NS_PER_S, RAD_PER_DEG, T_PER_UT
 
@@ -276,7 +274,7 @@ class _JsonLines:
         shown: object = sample
         if self._fields is not None:
             shown = {name: value for name in self._fields if (value := getattr(sample, name)) is not None}
-        return msgspec.json.encode(shown).decode() + "\n"
+        return printable_json(shown) + "\n"
 
 
 class _Csv:

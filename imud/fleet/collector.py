@@ -20,6 +20,7 @@ from imud.fleet.accounts import BootKey, BootOffset, PlacedTime
 from imud.fleet.connection import RECEIVE_MAX, FleetDelivery
 from imud.fleet.messages import Interval, MessageKind
 from imud.fleet.reader import WHOLE, Fleet, FleetBatch, FleetSession, Share
+from imud.host.log import printable_json
 from imud.model.units import NS_PER_S
 
 COMMIT_S: Final = 0.5
@@ -126,6 +127,7 @@ class FleetCollector:
         """`times` receives the durations of transactions. Raises BadArgument if a name of the selection or the share
         is invalid."""
         self.session = session_of(fleet, selection, share)
+        self.write_start_ns: int | None = None  # start of the present transaction; None without one
         self.is_drained = False  # True after `run` of a surplus share that received all waiting messages
         self._store, self._now_ns, self._times = store, fleet.now_ns, times or TransactionTimes()
         self._stopped = False
@@ -169,7 +171,11 @@ class FleetCollector:
     async def _write(self, session: FleetSession, turn: Sequence[FleetDelivery]) -> None:
         """Store the messages of a turn and acknowledge them."""
         begin_ns = self._now_ns()
-        await asyncio.to_thread(self._store.write, turn)
+        self.write_start_ns = begin_ns
+        try:
+            await asyncio.to_thread(self._store.write, turn)
+        finally:
+            self.write_start_ns = None
         if turn:
             self._times.add((self._now_ns() - begin_ns) / NS_PER_S)
         for delivery in turn:
@@ -177,7 +183,6 @@ class FleetCollector:
 
 
 NOT_SET: Final = {"utc": "not set"}
-_ENCODER: Final = msgspec.json.Encoder()
 
 
 class JsonLines:
@@ -250,4 +255,4 @@ def _members(record: msgspec.Struct) -> dict[str, object]:
 
 
 def _line(members: dict[str, object]) -> str:
-    return _ENCODER.encode(members).decode()
+    return printable_json(members)

@@ -21,6 +21,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Final
 
+import msgspec
+
 log = logging.getLogger(__name__)
 
 # Maximum length of one value. The longest product string, of a USB descriptor, has 126 characters.
@@ -58,6 +60,23 @@ def printable(text: str, characters_max: int = VALUE_CHARACTERS_MAX) -> str:
     if len(text) <= characters_max and len(escaped) <= characters_max:
         return escaped
     return escaped[: characters_max - 1] + "…"
+
+
+def printable_json(value: object) -> str:
+    r"""Return `value` as one line of JSON with escapes (`\u202e`) for characters that control a terminal.
+
+    Texts of devices, adapters and other hosts can contain such characters. JSON permits them without an escape.
+    """
+    text: str = msgspec.json.encode(value).decode()
+    if text.isprintable():
+        return text
+    # outside of strings, the text contains printable ASCII only
+    return "".join(c if c.isprintable() else _json_escape(c) for c in text)
+
+
+def _json_escape(character: str) -> str:
+    data = character.encode("utf-16-be", "surrogatepass")
+    return "".join(f"\\u{data[i]:02x}{data[i + 1]:02x}" for i in range(0, len(data), 2))
 
 
 def shown(value: object, characters_max: int = VALUE_CHARACTERS_MAX) -> str:

@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import subprocess
 import sys
 import time
@@ -17,7 +18,7 @@ from imud.cli.output import bar_width, fitted, histogram, local_time, paragraph,
 from tests.cli.conftest import Cli
 from tests.cli.recorded_daemon import run_recorded
 from tests.support.daemon_process import LIMIT_S, running_daemon
-from tests.support.files import hi91
+from tests.support.files import ROOT, hi91
 from tests.support.surroundings import pipe
 
 
@@ -211,3 +212,10 @@ def test_a_full_disk_is_an_error_of_commands_that_ask_the_daemon(tmp_path: Path)
     with running_daemon(tmp_path, {}) as daemon, open("/dev/full", "wb") as full:
         for words in (["status"], ["status", "--json"], ["devices"], ["clock"]):
             assert ended([*words, "--socket", str(daemon.socket)], full.fileno()) == 2, words
+
+
+def test_commands_print_escaped_json() -> None:
+    """A text of a device can contain U+202E and C1 control characters. `printable_json` escapes them."""
+    unescaped = re.compile(r"msgspec\.json\.encode\((?!tree|self\.records)")
+    modules = [file for file in (ROOT / "imud/cli").rglob("*.py") if unescaped.search(file.read_text())]
+    assert modules == []

@@ -1,5 +1,6 @@
 """Each message is one line for any content, and a slow reader of the log never delays the caller."""
 
+import json
 import logging
 import os
 import re
@@ -291,3 +292,10 @@ def test_a_file_receives_messages_and_reports_of_python(tmp_path: Path, monkeypa
     assert re.search(r"ERROR Exception ignored (in|while calling deallocator) <function \S*Unclosable\.__del__", text)
     assert "KeyError: 'not closed'" in text
     assert "DeprecationWarning: out of date" in text
+
+
+@pytest.mark.parametrize("text", [*HOSTILE[:-5], HOSTILE[-3], "\u202eevil", "\x9b31m", "\U000e0001tag", "plain °µ"])
+def test_json_has_no_control_characters(text: str) -> None:
+    line = host_log.printable_json({"name": text, text: [text]})
+    assert line.isprintable()
+    assert json.loads(line) == {"name": text, text: [text]}

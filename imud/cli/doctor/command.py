@@ -12,15 +12,13 @@ from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
-import msgspec
-
 from imud.cli.arguments import CliCommand, add_socket
 from imud.cli.doctor import buses, daemon, machine, ports
 from imud.cli.doctor.surroundings import DoctorCheck, DoctorFinding, Severity, Surroundings, ask_daemon, file_of_daemon
 from imud.cli.output import COLUMNS
 from imud.cli.run import DEFAULT_FILE
 from imud.host.installation import documents
-from imud.host.log import MESSAGE_CHARACTERS_MAX, printable
+from imud.host.log import MESSAGE_CHARACTERS_MAX, printable, printable_json
 from imud.model.errors import ImudError
 
 MARGIN: Final = 13  # width of the column with the severities, characters
@@ -110,10 +108,10 @@ def _wrapped(text: str) -> list[str]:
     return textwrap.wrap(printable(text, MESSAGE_CHARACTERS_MAX), COLUMNS - MARGIN, break_on_hyphens=False)
 
 
-def as_json(examined: Sequence[Examined]) -> bytes:
+def as_json(examined: Sequence[Examined]) -> str:
     """Return all findings by check, as JSON."""
     found = [finding for one in examined for finding in one.findings]
-    return msgspec.json.encode(
+    return printable_json(
         {
             "status": exit_status(examined),
             "complete": all(finding.severity is not Severity.NOT_CHECKED for finding in found),
@@ -175,7 +173,7 @@ def run(args: argparse.Namespace) -> int:
     file = args.config or file_of_daemon(args.socket) or DEFAULT_FILE
     at = Surroundings(file.absolute(), partial(ask_daemon, args.socket))
     examined = examine(CHECKS, at)
-    sys.stdout.write((as_json(examined).decode() if args.json else page(examined)) + "\n")
+    sys.stdout.write((as_json(examined) if args.json else page(examined)) + "\n")
     return exit_status(examined)
 
 

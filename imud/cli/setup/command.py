@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
     )  # fmt: skip
     status = steps.set_up(wanted, args.can, control=args.control, wait_s=args.wait)
     if args.json:
-        sys.stdout.write(steps.as_json().decode() + "\n")
+        sys.stdout.write(steps.as_json() + "\n")
     return status
 
 

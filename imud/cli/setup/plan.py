@@ -9,14 +9,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
-import msgspec
-
 from imud import config
 from imud.cli.doctor.ports import entries
 from imud.cli.doctor.surroundings import Surroundings
 from imud.cli.setup.changes import Change, CommandChange, FileChange, Words, content_of
 from imud.cli.setup.hardware import Attached, state
 from imud.config.yaml import YamlTree, plain, read_yaml
+from imud.host.log import printable_json
 from imud.model.errors import ImudError
 
 RULES: Final = "/etc/udev/rules.d/61-imud-setup.rules"
@@ -223,7 +222,7 @@ def _scalar(value: object) -> str:
         except ValueError:
             pass
     # JSON is YAML
-    return msgspec.json.encode(value).decode()
+    return printable_json(value)
 
 
 UNIT: Final = "imud.service"

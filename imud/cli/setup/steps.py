@@ -45,7 +45,7 @@ from imud.cli.setup.plan import (
 )
 from imud.config.reading import DEVICE_NAME
 from imud.contracts.status import DeviceState, DeviceStatus
-from imud.host.log import MESSAGE_CHARACTERS_MAX, printable
+from imud.host.log import MESSAGE_CHARACTERS_MAX, printable, printable_json
 from imud.host.netlink import absence, can_interfaces
 from imud.model.errors import BadArgument, ConfigError, ImudError
 from imud.model.units import NS_PER_MS
@@ -404,13 +404,13 @@ class SetupSteps:
         self._talk.say("All devices send samples. `imud watch` prints them, `imud status` prints their state.")
         return DONE
 
-    def as_json(self) -> bytes:
+    def as_json(self) -> str:
         """Return the found devices, the changes and the device states as JSON."""
         found: dict[str, Any] = {
             "found": self._found, "changes": self._announced, "made": self._changed, "notes": self._notes,
             "devices": self._status,
         }  # fmt: skip
-        return msgspec.json.encode(found)
+        return printable_json(found)
 
     # --- undo ---------------------------------------------------------------------------------------------------------
 
