@@ -264,16 +264,20 @@ class RecordedDiagnosis:
     def __init__(self) -> None:
         self._devices: dict[str, _RecordedDevice] = {}
 
-    def samples(self, device: str, samples: Sequence[Sample]) -> Diagnoses | None:
-        """Process at least one sample of a device. Return the diagnoses if they are due."""
-        newest = samples[-1]
-        known = self._device(device)
-        known.samples(newest, len(samples))
-        if not known.is_due:
-            return None
-        for one in self._devices.values():
-            one.pass_second()
-        return self._all(newest.utc_ns)
+    def samples(self, device: str, samples: Sequence[Sample]) -> list[Diagnoses]:
+        """Process samples of a device. Return the diagnoses at the end of each second.
+
+        The result does not depend on the division of the samples into batches.
+        """
+        recorded_device = self._device(device)
+        diagnoses = []
+        for sample in samples:
+            recorded_device.sample(sample)
+            if recorded_device.is_due:
+                for other_device in self._devices.values():
+                    other_device.pass_second()
+                diagnoses.append(self._all(sample.utc_ns))
+        return diagnoses
 
     def losses(self, losses: LossCounts) -> None:
         """Process the losses of a device."""
@@ -326,8 +330,9 @@ class _RecordedDevice:
         self._warning = _LossWarning()
         self._losing = False
 
-    def samples(self, newest: Sample, count: int) -> None:
-        self._newest, self._count = newest, self._count + count
+    def sample(self, newest: Sample) -> None:
+        self._newest = newest
+        self._count += 1
         self._losing = self._warning.is_on(list(self._counts.values()), newest.t_ns)
 
     def losses(self, losses: LossCounts) -> None:

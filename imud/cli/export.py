@@ -2,9 +2,11 @@
 
 import argparse
 import os
+import re
 import stat
 import sys
 from contextlib import closing, suppress
+from fcntl import LOCK_EX, LOCK_NB, flock
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Final, Self
@@ -46,7 +48,7 @@ from imud.contracts.status import Deviations
 from imud.drivers import DRIVERS
 from imud.formats.can import CandumpReader
 from imud.formats.capture import CaptureReader
-from imud.host.files import WRITE_FLAGS, open_regular
+from imud.host.files import READ_FLAGS, WRITE_FLAGS, open_regular
 from imud.host.installation import needs_extra
 from imud.host.log import STDERR, log_to
 from imud.model.errors import BadArgument, ImudError, reason_of
@@ -119,8 +121,11 @@ class ExportFile:
             if there is not None and not stat.S_ISREG(there.st_mode):
                 return path.open("wb", buffering=0)  # a FIFO or a device node cannot be renamed
             self._path = path
+            _remove_stale_parts(path)
             self._part = path.with_name(f".{path.name}.{os.getpid()}.part")
-            return open(os.open(self._part, WRITE_FLAGS, MODE), "wb", buffering=0)
+            descriptor = os.open(self._part, WRITE_FLAGS, MODE)
+            flock(descriptor, LOCK_EX | LOCK_NB)
+            return open(descriptor, "wb", buffering=0)
         except OSError as error:
             raise self._failure(error) from error
 
@@ -145,6 +150,21 @@ class ExportFile:
 
     def _failure(self, error: OSError) -> ImudError:
         return ImudError(f"cannot write {self.name}: {reason_of(error)}; imud removed the incomplete export")
+
+
+def _remove_stale_parts(path: Path) -> None:
+    """Remove the incomplete files of killed exports to `path`. A running export holds the lock of its file."""
+    pattern = re.compile(rf"\.{re.escape(path.name)}\.\d+\.part")
+    for part in path.parent.iterdir():
+        if pattern.fullmatch(part.name) is None:
+            continue
+        with suppress(OSError):
+            descriptor = os.open(part, READ_FLAGS | os.O_NOFOLLOW)
+            try:
+                flock(descriptor, LOCK_EX | LOCK_NB)
+                part.unlink()
+            finally:
+                os.close(descriptor)
 
 
 FORMATS: Final = ("csv", "mcap")

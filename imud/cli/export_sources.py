@@ -1,25 +1,16 @@
-"""Export of a recording or a capture: players that read the file, and sinks that write CSV or MCAP.
-
-A large recording is played in a second process (`python -m imud.cli.export_sources`), which sends the samples through a
-pipe. Decoding and writing then use two CPU cores.
-"""
+"""Export of a recording or a capture: players that read the file, and sinks that write CSV or MCAP."""
 
 import shutil
-import struct
-import subprocess
 import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
-from fcntl import F_SETPIPE_SZ, fcntl
 from operator import attrgetter
 from pathlib import Path
 from time import monotonic
-from typing import IO, TYPE_CHECKING, Any, BinaryIO, Final, NamedTuple, Protocol, TextIO
+from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple, Protocol, TextIO
 
 import msgspec
 
 from imud.attitude.conventions import Convention
-from imud.attitude.published import PublishedAxes
 from imud.bridges import csv as table
 from imud.bridges.channel import (
     ByteWriter,
@@ -40,15 +31,14 @@ from imud.formats.can import CandumpReader
 from imud.formats.capture import CaptureReader
 from imud.formats.recording import RecordingReader
 from imud.formats.records import DeviceRecord, Kind, decode_object
-from imud.host.files import open_regular
 from imud.host.threads import rare_garbage_collection
 from imud.model.errors import BadArgument, ImudError, reason_of
-from imud.model.event import Event, kind_of
+from imud.model.event import Event
 from imud.model.ledger import Ledger
 from imud.model.options import Options
 from imud.model.sample import SAMPLE_FIELDS, Sample
 from imud.recording.capture_player import CapturePlayer, KnownTimes
-from imud.recording.player import PlayedDevice, Player, RecordedClock, RecordedEvent
+from imud.recording.player import PlayedDevice, Player, RecordedClock
 
 if TYPE_CHECKING:  # imports libraries of the extra `export`, which CSV does not need
     from imud.bridges.mcap import McapChannel, McapFile
@@ -120,12 +110,8 @@ class CsvSink:
     def close(self) -> None: ...
 
 
-HEAD: Final = struct.Struct("<BIQ")  # head of a message in the pipe: kind, length and read position in the file, bytes
-LENGTH_MAX: Final = 1 << 26  # Maximum length of a message, bytes. Valid messages are much shorter.
-PIPE_BYTES: Final = 1 << 20  # requested size of the pipe: the player continues while the writer compresses a chunk
-SAMPLES: Final = 64  # maximum in a message: 0.16 s at 400 Hz, so that devices stay nearly in the order of time
+SAMPLES: Final = 64  # maximum in a batch: 0.16 s at 400 Hz, so that devices stay nearly in the order of time
 GC_ALLOCATIONS: Final = 50_000  # allocations between two garbage collections: almost no reference cycles occur
-DEVICE, BATCH, LOSSES, EVENT, END, ERROR, SESSION = range(1, 8)
 _LOST: Final = attrgetter("samples", *LossCounts._fields[4:])  # counters of a ledger in the order of `LossCounts`
 
 Played = tuple[str, int, list[str]]  # report as text, exit status, names of the devices
@@ -157,126 +143,63 @@ class LossWatch:
             self._sink.event(StampedEvent(event, utc_ns))
 
 
-def play_here(file: BinaryIO, name: str, sink: Sink, devices: Collection[str]) -> Played:
-    """Play a recording in this process. Raises ImudError."""
-    watch = LossWatch(sink, devices)
+class BatchingSink:
+    """Sink that joins the samples of one device to batches of SAMPLES: another sink then needs half of the CPU time."""
+
+    def __init__(self, sink: Sink) -> None:
+        self._sink = sink
+        self._first: Batch | None = None  # first of the joined batches
+        self._samples: list[Sample] = []
+
+    def samples(self, batch: Batch) -> None:
+        first = self._first
+        if first is None or batch.device_id != first.device_id or batch.frame is not first.frame:
+            self.flush()
+            self._first = batch
+        self._samples += batch.samples
+        if len(self._samples) >= SAMPLES:
+            self.flush()
+
+    def losses(self, losses: LossCounts) -> None:
+        self.flush()  # keep the order of samples and losses
+        self._sink.losses(losses)
+
+    def event(self, event: StampedEvent) -> None:
+        self.flush()
+        self._sink.event(event)
+
+    def session(self, epoch: int) -> None:
+        self.flush()
+        self._sink.session(epoch)
+
+    def flush(self) -> None:
+        """Pass the joined samples to the other sink."""
+        samples, self._samples = self._samples, []
+        if samples:
+            assert self._first is not None
+            self._sink.samples(Batch(self._first.device, self._first.device_id, samples, self._first.frame))
+
+    def finish(self) -> None:
+        self.flush()
+        self._sink.finish()
+
+    def close(self) -> None:
+        self._sink.close()
+
+
+def play_recording(file: BinaryIO, name: str, sink: Sink, devices: Collection[str]) -> Played:
+    """Play a recording. Raises ImudError."""
+    batches = BatchingSink(sink)
+    watch = LossWatch(batches, devices)
 
     def count(batch: Batch) -> None:
         watch.batch(batch, player.devices[batch.device_id].ledger)
 
-    player = Player(count, on_event=watch.event, on_session=sink.session)
-    report, status = play_to_end(file, name, player)
+    player = Player(count, on_event=watch.event, on_session=batches.session)
+    with rare_garbage_collection(GC_ALLOCATIONS):
+        report, status = play_to_end(file, name, player)
+        batches.flush()
     return report, status, sorted({device.described.name for device in player.all_devices})
-
-
-def play_beside(path: Path, sink: Sink, devices: Sequence[str], at: Callable[[int], None]) -> Played:
-    """Play a recording in a second process. Call `at` with the read position in bytes. Raises ImudError."""
-    # -P: the module comes from the tree of this process, never from the current directory
-    argv = [sys.executable, "-P", "-m", "imud.cli.export_sources", str(path.absolute()), *devices]
-    with subprocess.Popen(argv, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL) as process:
-        assert process.stdout is not None
-        with suppress(OSError):  # above fs.pipe-max-size or the user's limit: a smaller pipe is only slower
-            fcntl(process.stdout, F_SETPIPE_SZ, PIPE_BYTES)
-        try:
-            return _take(process.stdout, path, sink, at)
-        finally:
-            process.kill()
-
-
-def _take(pipe: IO[bytes], path: Path, sink: Sink, at: Callable[[int], None]) -> Played:
-    """Pass the messages of the pipe to a sink until the end message. Return its content."""
-    frames: dict[int, tuple[str, PublishedAxes]] = {}
-    decode_samples = msgspec.msgpack.Decoder(list[Sample]).decode
-    while len(head := pipe.read(HEAD.size)) == HEAD.size:
-        kind, length, position = HEAD.unpack(head)
-        data = pipe.read(min(length, LENGTH_MAX))
-        if len(data) < length:
-            break
-        if kind == BATCH:
-            device_id = int.from_bytes(data[:2], "little")
-            name, frame = frames[device_id]
-            at(position)
-            sink.samples(Batch(name, device_id, decode_samples(data[2:]), frame))
-        elif kind == DEVICE:
-            device_id, name, frame = msgspec.msgpack.decode(data, type=tuple[int, str, PublishedAxes])
-            frames[device_id] = name, frame
-        elif kind == LOSSES:
-            sink.losses(msgspec.msgpack.decode(data, type=LossCounts))
-        elif kind == EVENT:
-            recorded, utc_ns = msgspec.msgpack.decode(data, type=tuple[RecordedEvent, int])
-            event = Event(recorded.t_ns, recorded.device, kind_of(recorded.kind), recorded.message, recorded.detail)
-            sink.event(StampedEvent(event, utc_ns))
-        elif kind == SESSION:
-            sink.session(msgspec.msgpack.decode(data, type=int))
-        elif kind == END:
-            played: Played = msgspec.msgpack.decode(data, type=Played)
-            return played
-        else:
-            raise ImudError(data.decode(errors="replace"))
-    raise ImudError(f"cannot read {path}: the player process ended early; is there enough memory, was it killed?")
-
-
-class PipeSink:
-    """Sink that writes messages to a pipe."""
-
-    def __init__(self, out: BinaryIO, position: Callable[[], int]) -> None:
-        self._out = out
-        self._position = position
-        self._frames: dict[int, PublishedAxes] = {}
-        self._waiting: list[Sample] = []
-        self._device_id = -1
-        self._encode = msgspec.msgpack.Encoder().encode
-
-    def samples(self, batch: Batch) -> None:
-        """Buffer samples of one device."""
-        device_id = batch.device_id
-        if device_id != self._device_id or batch.frame is not self._frames.get(device_id):
-            self.finish()
-            self._device_id, self._frames[device_id] = device_id, (frame := batch.frame)
-            words = (frame.device, frame.mounting, frame.convention, frame.declination_deg, frame.from_angles)
-            self._put(DEVICE, self._encode((device_id, batch.device, PublishedAxes(*words))))
-        self._waiting += batch.samples
-        if len(self._waiting) >= SAMPLES:
-            self.finish()
-
-    def losses(self, losses: LossCounts) -> None:
-        self.finish()  # keep the order of samples and losses
-        self._put(LOSSES, self._encode(losses))
-
-    def event(self, event: StampedEvent) -> None:
-        self.finish()
-        self._put(EVENT, self._encode(event))
-
-    def session(self, epoch: int) -> None:
-        self.finish()
-        self._put(SESSION, self._encode(epoch))
-
-    def end(self, kind: int, value: Any) -> None:
-        """Write the last message: the result (END), or the text of an error (ERROR)."""
-        self.finish()
-        self._put(kind, value.encode() if isinstance(value, str) else self._encode(value))
-        self._out.flush()
-
-    def finish(self) -> None:
-        """Write the buffered samples."""
-        samples, self._waiting = self._waiting, []
-        if samples:
-            self._put(BATCH, self._device_id.to_bytes(2, "little") + self._encode(samples))
-
-    def close(self) -> None: ...
-
-    def _put(self, kind: int, data: bytes) -> None:
-        self._out.write(HEAD.pack(kind, len(data), self._position()) + data)
-
-
-def main(path: str, devices: Sequence[str]) -> None:
-    """Play a recording to standard output, as the second process of an export."""
-    with rare_garbage_collection(GC_ALLOCATIONS), open_regular(path) as file:
-        sink = PipeSink(sys.stdout.buffer, file.tell)
-        try:
-            sink.end(END, play_here(file, path, sink, devices))
-        except ImudError as error:
-            sink.end(ERROR, str(error))
 
 
 EVERY_S: Final = 0.2  # time between two updates of the progress bar, s
@@ -331,8 +254,6 @@ class Progress:
 
 
 NOISE: Final = "noise"  # key of the noise in the recorded configuration of a device
-# Minimum size of a recording for a second process, bytes. The start of a process takes as long as 20,000 samples.
-BESIDE_BYTES: Final = 1_000_000
 
 
 class Exported(NamedTuple):
@@ -383,19 +304,14 @@ class ExportFeed:
         self._sink = sink
         self._clock = clock
         self._file = file
-        self._read_bytes: int | None = None
         self._progress = progress
         self._convention = convention
         self.samples_taken = 0  # number of exported samples
 
-    def at(self, read_bytes: int) -> None:
-        """Set the read position of the file, if another process reads the file."""
-        self._read_bytes = read_bytes
-
     def samples(self, batch: Batch) -> None:
         self._sink.samples(self._clock.placed(batch).converted(self._convention))
         self.samples_taken += len(batch.samples)
-        self._progress.add(len(batch.samples), self._position)
+        self._progress.add(len(batch.samples), self._file.tell)
 
     def losses(self, losses: LossCounts) -> None:
         self._sink.losses(losses._replace(utc_ns=self._clock.utc_ns(losses.t_ns, losses.utc_ns)))
@@ -411,16 +327,10 @@ class ExportFeed:
 
     def close(self) -> None: ...
 
-    def _position(self) -> int:
-        return self._file.tell() if self._read_bytes is None else self._read_bytes
-
 
 def export_recording(file: BinaryIO, path: Path, feed: ExportFeed, devices: Sequence[str]) -> Exported:
     """Export a recording. Raises ImudError, and BadArgument if the recording does not contain a selected device."""
-    if path.stat().st_size < BESIDE_BYTES:
-        report, status, known = play_here(file, str(path), feed, devices)
-    else:
-        report, status, known = play_beside(path, feed, devices, feed.at)
+    report, status, known = play_recording(file, str(path), feed, devices)
     for name in devices:
         if name not in known:
             raise BadArgument(f"--device {name}: expected a device of the recording: {', '.join(known) or 'none'}")
@@ -500,7 +410,8 @@ class McapSink:
         times_ns = [sample.utc_ns for sample in samples]
         for channel in channels:
             channel.add(samples, times_ns)
-        self._diagnose(self._diagnosis.samples(batch.device, samples))
+        for diagnoses in self._diagnosis.samples(batch.device, samples):
+            self._diagnose(diagnoses)
 
     def losses(self, losses: LossCounts) -> None:
         self._diagnosis.losses(losses)
@@ -581,10 +492,3 @@ class _SampleChannel:
         if self._channel is None:
             self._channel = self._sink.open_channel(self._described)
         self._channel.add_run(times_ns, messages)
-
-
-if __name__ == "__main__":
-    try:
-        main(sys.argv[1], sys.argv[2:])
-    except (BrokenPipeError, KeyboardInterrupt):  # the parent process has ended
-        sys.stdout = None  # prevents a flush at exit, which would fail

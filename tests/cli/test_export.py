@@ -437,3 +437,21 @@ def test_a_fifo_is_written_in_place(tmp_path: Path) -> None:
     reader.join(10)
     assert got == [b"through"]
     assert fifo.is_fifo()
+
+
+def test_part_of_killed_export_is_removed(tmp_path: Path) -> None:
+    """The part of a running export has a lock. Files with other names belong to other programs."""
+    killed, other = tmp_path / ".a.4194305.part", tmp_path / ".a.x.part"
+    for file in (killed, other):
+        file.write_bytes(b"incomplete")
+    with output(tmp_path / "a", tmp_path) as running:
+        running.write(b"first")
+        (part,) = set(tmp_path.glob(".a.*.part")) - {other}
+        assert part.read_bytes() == b"first"
+        part.rename(tmp_path / ".a.4194306.part")
+        with output(tmp_path / "a", tmp_path) as second:
+            second.write(b"second")
+        assert (tmp_path / ".a.4194306.part").exists(), "the first export runs"
+        (tmp_path / ".a.4194306.part").rename(part)
+    assert (tmp_path / "a").read_bytes() == b"first"
+    assert sorted(file.name for file in tmp_path.iterdir()) == [".a.x.part", "a", "source"]
