@@ -67,7 +67,11 @@ COLLECTOR_METRICS: Final = (
     _gauge("imud_fleet_collector_shares", "shares that this collector holds"),
     _gauge("imud_fleet_collector_free_shares", "shares that no collector holds, as this collector sees them"),
     _gauge("imud_fleet_collector_broker_connected", "1 while all shares of this collector have a broker, else 0"),
-    _gauge("imud_fleet_collector_database_connected", "1 while this collector is connected to the database, else 0"),
+    _gauge(
+        "imud_fleet_collector_database_connected",
+        "1 while this collector is connected to the database and each transaction ends within 8 s, else 0",
+    ),
+    _gauge("imud_fleet_collector_transaction_age_seconds", "duration of the longest transaction that has not ended"),
 )  # fmt: skip
 FLEET_METRICS: Final = (
     _gauge("imud_fleet_gateways", "gateways by site and state: online, silent or offline", "site", "state"),
@@ -100,6 +104,7 @@ def collector_metrics(status: CollectorStatus) -> Iterator[Metric]:
         "free_shares": status.free_shares,
         "broker_connected": status.broker_connected,
         "database_connected": status.database_connected,
+        "transaction_age_seconds": status.write_s,
     }
     for one in COLLECTOR_METRICS:
         if one.type is CollectorMetricType.HISTOGRAM:

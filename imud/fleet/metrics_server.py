@@ -3,9 +3,9 @@
     HTTP thread ──request──▶ FleetGauges (a thread) ──one transaction──▶ database
         ◀── page ── FleetShares.status + newest snapshot of the fleet
 
-One collector of a fleet reads the metrics of the fleet from the database, at most every REFRESH_S. It holds an advisory
-lock. If it ends, or if no Prometheus scrapes it for UNUSED_S, the next scraped collector takes the lock. The other
-collectors have no metrics of the fleet. The scrape does not wait longer than WAIT_S for the database.
+One collector of a fleet reads the metrics of the fleet from the database, at most every REFRESH_S. It holds a lease. If
+it ends, or if no Prometheus scrapes it for UNUSED_S, the next scraped collector takes the lease. The other collectors
+have no metrics of the fleet. The scrape does not wait longer than WAIT_S for the database.
 """
 
 import asyncio
@@ -16,6 +16,7 @@ from typing import Final
 
 from prometheus_client import CollectorRegistry, ProcessCollector
 
+from imud.fleet.database.leases import LeaseHolder, LeaseKey, LeaseKind
 from imud.fleet.database.overview import FleetSelection, OverviewReader
 from imud.fleet.metrics import FleetSnapshot, MetricsPage
 from imud.fleet.shares import CollectorStatus
@@ -27,6 +28,8 @@ log = logging.getLogger(__name__)
 
 REFRESH_S: Final = 15.0  # minimum time between two reads of the database, s
 UNUSED_S: Final = 60.0  # time without a scrape after which another collector can read the metrics of the fleet, s
+LEASE_S: Final = UNUSED_S + 30.0  # time without a read after which another collector can take the lease, s
+LEASE: Final = LeaseKey(LeaseKind.METRICS, "", 0)
 WAIT_S: Final = 3.0  # maximum time that a scrape waits for the database, s; the server closes connections after 5 s
 POLL_S: Final = 0.02  # interval at which a scrape checks whether the snapshot is ready, s
 STATEMENT_S: Final = 10.0  # maximum time of a statement, s; 10,000 gateways with 30 streams need 0.2 s
@@ -57,6 +60,7 @@ class FleetGauges:
         self._url, self._selection = url, FleetSelection(silent_s=silent_s)
         self._now_ns, self._refresh_ns, self._unused_s = now_ns, round(refresh_s * NS_PER_S), unused_s
         self._reader: OverviewReader | None = None
+        self._lease = LeaseHolder(url, LEASE_S)
         self._snapshot: tuple[FleetSnapshot, int] | None = None  # snapshot and its time (CLOCK_MONOTONIC), ns
         self._tried_ns: int | None = None  # time of the last read, ns; None before the first
         self._problem = ""
@@ -111,7 +115,8 @@ class FleetGauges:
         try:
             if self._reader is None:
                 self._reader = OverviewReader(self._url, statement_s=STATEMENT_S)
-            if not self._reader.take_lead():
+                self._lease.connect()
+            if not self._lease.take(LEASE):
                 self._snapshot = None
                 return
             snapshot = FleetSnapshot(self._reader.groups(self._selection), self._reader.collectors().collectors)
@@ -123,8 +128,9 @@ class FleetGauges:
             self._problem = str(error)
 
     def _release(self) -> None:
-        """Close the connection and thereby release the lock."""
+        """Close the connections and thereby release the lease."""
         self._snapshot = None
+        self._lease.close()
         if self._reader is not None:
             self._reader.close()
             self._reader = None

@@ -1,25 +1,23 @@
 """Shares of a fleet: several collectors divide the messages of one fleet and write to one PostgreSQL database.
 
-    ShareLocks (one connection) ──▶ FleetShares ──▶ for each held share: session ──▶ FleetCollector ──▶ PostgresStore
+    ShareLeases (one connection) ──▶ FleetShares ──▶ for each held share: session ──▶ FleetCollector ──▶ PostgresStore
 
-Each share has an advisory lock. One collector at a time holds it. All collectors also hold a common lock, so that each
-collector knows the number of running collectors, and holds its part of the shares. PostgreSQL releases the locks if the
-collector ends, and after IDLE_S if its host or process stops without an end of the connection.
-
-The locks only divide the work. Each row is stored once even if two collectors hold the same share for a moment: the
-ledger in the database decides that.
+Each share has a lease in the database. One collector at a time holds it. Each collector also holds a lease of its own,
+so that the others know the number of running collectors, and hold their part of the shares. The leases end when the
+collector ends, and after LEASE_S if its host or process stops without an end of the connection.
 """
 
 import asyncio
 import logging
-from collections.abc import Collection
+from collections.abc import Callable, Collection
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
-from hashlib import blake2s
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 
 from imud.fleet.collector import FleetCollector, Selection, TransactionTimes, session_of
+from imud.fleet.database.leases import Lease, LeaseHolder, LeaseKey, LeaseKind
 from imud.fleet.database.settings import CollectorSettings
-from imud.fleet.database.store import PostgresStore, connected, sentence_of
+from imud.fleet.database.store import PostgresStore
 from imud.fleet.database.transaction import StoreCounts
 from imud.fleet.reader import SHARES_MAX, Fleet, Share
 from imud.model.errors import BadArgument, ServerError, reason_of
@@ -27,104 +25,84 @@ from imud.model.units import NS_PER_S
 
 log = logging.getLogger(__name__)
 
-TURN_S: Final = 2.0  # time between two checks of the locks, s
-# Time without a check after which PostgreSQL ends the connection with the locks, s. A slow host can miss some checks.
-IDLE_S: Final = 15
+T = TypeVar("T")
+
+TURN_S: Final = 2.0  # time between two renewals of the leases, s
 # Time for which a collector does not take a share again after a failure, s. Another collector takes the share first.
 RETRY_S: Final = 10.0
 
-# Second key of the lock of all collectors with one name, plus 30 bits of the selection. Shares have lower numbers.
-PRESENCE: Final = 1 << 30
-_LOCKS: Final = (
-    "SELECT objid::bigint, count(*) FROM pg_locks WHERE locktype = 'advisory' AND granted AND objsubid = 2 "
-    "AND classid = %s::bigint::oid AND database = (SELECT oid FROM pg_database WHERE datname = current_database()) "
-    "GROUP BY objid"
-)
-_TAKE: Final = "SELECT pg_try_advisory_lock(%s, %s)"
-# PostgreSQL 13 has no such setting. Keep-alives of TCP then detect a host that stops, but not a process that stops.
-_IDLE: Final = f"SELECT set_config(name, '{IDLE_S * 1000}', false) FROM pg_settings WHERE name = 'idle_session_timeout'"
+# Duration of a transaction that is a problem, s. With TURN_S, the log and the metrics report it within 10 s.
+PROBLEM_S: Final = 8.0
 
 
-class LockView(NamedTuple):
-    """Locks of all collectors with one name."""
+class ShareView(NamedTuple):
+    """Leases of all collectors with one name."""
 
     live: int  # number of running collectors, with this collector
     held: frozenset[int]  # numbers of the shares that any collector holds
 
 
-class ShareLocks:
-    """Advisory locks of one collector. Synchronization: one thread at a time."""
+class ShareLeases:
+    """Leases of one collector. Synchronization: one thread at a time."""
 
     def __init__(self, url: str, name: str, selection: Selection) -> None:
-        self.own: set[int] = set()  # numbers of the shares whose locks this collector holds
-        self._url, self._name = url, name
-        self._group = _hashed(name) >> 1  # the first key of a lock is a positive int4
-        self._presence = PRESENCE | _hashed("/".join(one or "" for one in selection)) >> 2
-        self._connection: Any = None
+        self.own: set[int] = set()  # numbers of the shares that this collector holds
+        self._name = name
+        self._selection = "/".join(part or "" for part in selection)
+        self._holder = LeaseHolder(url)
 
     @property
     def is_connected(self) -> bool:
-        return self._connection is not None
+        return self._holder.is_connected
 
     def connect(self) -> None:
-        """Connect and take the lock of all collectors. Raises ServerError; raises BadArgument if a collector with the
+        """Connect and take the lease of this collector. Raises ServerError; raises BadArgument if a collector with the
         same name has another selection."""
         self.close()
-        self._connection = connected(self._url)
-        self._connection.autocommit = True
-        self._call(_IDLE)
-        self._call("SELECT pg_advisory_lock_shared(%s, %s)", self._group, self._presence)
-        if any(key >= PRESENCE and key != self._presence for key, _ in self._locks()):
+        self._holder.connect()
+        key = LeaseKey(LeaseKind.COLLECTOR, self._name, self._holder.number)
+        self._holder.take(key, self._selection)
+        if any(lease.detail != self._selection for lease in self._collectors()):
             raise BadArgument(
                 f"--name: expected one selection of gateways for the collectors with the name {self._name!r}, but "
                 "another collector of this database has this name and another --site, --gateway or --device; try "
                 "another --name"
             )
 
-    def view(self) -> LockView:
-        """Return the locks of all collectors. Raises ServerError."""
-        locks = dict(self._locks())
-        return LockView(locks.get(self._presence, 1), frozenset(key for key in locks if key < PRESENCE))
+    def view(self) -> ShareView:
+        """Renew the leases of this collector. Return the leases of all collectors. Raises ServerError."""
+        self._holder.renew()
+        leases = self._holder.read(self._name)
+        live = sum(lease.key.kind is LeaseKind.COLLECTOR for lease in leases)
+        held = frozenset(lease.key.number for lease in leases if lease.key.kind is LeaseKind.SHARE)
+        return ShareView(live, held)
 
     def take(self, number: int) -> bool:
-        """Take the lock of a share. Return False if another collector holds it. Raises ServerError."""
-        # PostgreSQL counts the locks of a connection: a second lock would need a second release
-        if number not in self.own and self._call(_TAKE, self._group, number)[0][0]:
+        """Take a share. Return False if another collector holds it. Raises ServerError."""
+        if number not in self.own and self._holder.take(self._key(number)):
             self.own.add(number)
         return number in self.own
 
     def release(self, number: int) -> None:
-        """Release the lock of a share. Do nothing if this collector does not hold it. Raises ServerError."""
+        """Release a share. Do nothing if this collector does not hold it. Raises ServerError."""
         if number in self.own:
             self.own.discard(number)
-            self._call("SELECT pg_advisory_unlock(%s, %s)", self._group, number)
+            self._holder.release(self._key(number))
+
+    def blocking_sessions(self, pid: int) -> str:
+        """Return the sessions that the server process `pid` waits for; empty if there are none. Raises ServerError."""
+        return self._holder.blocking_sessions(pid)
 
     def close(self) -> None:
-        """Close the connection and release all locks. A second call does nothing."""
-        connection, self._connection = self._connection, None
+        """Release all leases and close the connection. A second call does nothing."""
         self.own.clear()
-        if connection is not None:
-            connection.close()
+        self._holder.close()
 
-    def _locks(self) -> list[tuple[int, int]]:
-        """Return the second key of each lock and the number of its holders."""
-        return [(int(key), int(count)) for key, count in self._call(_LOCKS, self._group)]
+    def _collectors(self) -> list[Lease]:
+        return [lease for lease in self._holder.read(self._name) if lease.key.kind is LeaseKind.COLLECTOR]
 
-    def _call(self, statement: str, *values: object) -> list[Any]:
-        import psycopg
-
-        if self._connection is None:
-            raise ServerError("PostgreSQL: the connection with the locks of the shares is closed")
-        try:
-            found: list[Any] = self._connection.execute(statement, values).fetchall()
-        except psycopg.Error as error:
-            raise ServerError(f"PostgreSQL: {sentence_of(error)}") from error
-        return found
-
-
-def _hashed(text: str) -> int:
-    """Return a hash of 32 bits that is equal in all processes."""
-    return int.from_bytes(blake2s(text.encode(), digest_size=4).digest(), "big")
+    def _key(self, number: int) -> LeaseKey:
+        return LeaseKey(LeaseKind.SHARE, self._name, number)
 
 
 class Changes(NamedTuple):
@@ -134,7 +112,7 @@ class Changes(NamedTuple):
     release: tuple[int, ...] = ()
 
 
-def changes(total: int, view: LockView, own: Collection[int], paused: Collection[int]) -> Changes:
+def changes(total: int, view: ShareView, own: Collection[int], paused: Collection[int]) -> Changes:
     """Return the changes after which this collector holds its part of `total` shares: at most total / live, rounded up.
 
     `own` are the shares that this collector holds, `paused` the shares that it does not take now.
@@ -153,7 +131,8 @@ class CollectorStatus(NamedTuple):
     shares: int  # shares that this process holds
     free_shares: int | None  # shares that no collector holds; None without a connection to the database
     broker_connected: bool  # False if a share of this process has no connection to a broker
-    database_connected: bool
+    database_connected: bool  # False also while a transaction has not ended for PROBLEM_S
+    write_s: float  # duration of the longest transaction that has not ended, s; 0.0 without one
 
 
 class _ShareRun:
@@ -162,13 +141,21 @@ class _ShareRun:
     def __init__(self, share: Share) -> None:
         self.share = share
         self.collector: FleetCollector | None = None
+        self.store: PostgresStore | None = None
+        self.reported_ns: int | None = None  # start of the transaction that the log reports as slow
         self._stopped = False
 
-    def begin(self, collector: FleetCollector) -> None:
-        """Set the collector that `stop` stops."""
+    def begin(self, collector: FleetCollector, store: PostgresStore) -> None:
+        """Set the collector that `stop` stops, and its store."""
         self.collector = collector
+        self.store = store
         if self._stopped:
             collector.stop()
+
+    def write_s(self, now_ns: int) -> float:
+        """Return the duration of the transaction that has not ended, s; 0.0 without one."""
+        start_ns = None if self.collector is None else self.collector.write_start_ns
+        return 0.0 if start_ns is None else (now_ns - start_ns) / NS_PER_S
 
     def stop(self) -> None:
         """End after the present transaction."""
@@ -190,7 +177,7 @@ class FleetShares:
         self._from_begin = from_begin
         self._total = settings.shares
         session_of(fleet, selection, Share(0, self._total))  # check the selection and the version of MQTT
-        self._locks = ShareLocks(url, fleet.name, selection)
+        self._leases = ShareLeases(url, fleet.name, selection)
         self._runs: dict[int, _ShareRun] = {}
         self._tasks: dict[int, asyncio.Task[None]] = {}  # tasks of the runs
         self._counts: dict[int, StoreCounts] = {}  # counters of each share since the start
@@ -202,11 +189,13 @@ class FleetShares:
         self._stopped = False
         self._problem = ""
         self._changed = asyncio.Event()
+        # The threads of the stores can all wait for the database. The leases need a thread of their own.
+        self._thread = ThreadPoolExecutor(1, "fleet leases")
 
     @property
     def held(self) -> frozenset[int]:
         """Return the numbers of the shares that this collector holds."""
-        return frozenset(self._locks.own)
+        return frozenset(self._leases.own)
 
     @property
     def counts(self) -> StoreCounts:
@@ -220,10 +209,13 @@ class FleetShares:
         """Return the state of this process. Any thread may call this function."""
         runs = list(self._runs.values())
         sessions = [run.collector.session for run in runs if run.collector is not None]
+        now_ns = self._fleet.now_ns()
+        write_s = max((run.write_s(now_ns) for run in runs), default=0.0)
         return CollectorStatus(
-            self.counts, self._times.read(), sum(one.waiting for one in sessions), len(self._locks.own), self._free,
+            self.counts, self._times.read(), sum(one.waiting for one in sessions), len(self._leases.own), self._free,
             broker_connected=sum(one.is_connected for one in sessions) == len(runs),
-            database_connected=self._locks.is_connected,
+            database_connected=self._leases.is_connected and write_s < PROBLEM_S,
+            write_s=write_s,
         )  # fmt: skip
 
     def stop(self) -> None:
@@ -243,7 +235,7 @@ class FleetShares:
         now_ns = self._fleet.now_ns
         end_ns = None if stop_after_s is None else now_ns() + round(stop_after_s * NS_PER_S)
         try:
-            await asyncio.to_thread(self._check)
+            await self._in_thread(self._check)
             while not self._stopped and (end_ns is None or now_ns() < end_ns):
                 await self._turn()
                 left_s = TURN_S if end_ns is None else min(TURN_S, max(0.0, (end_ns - now_ns()) / NS_PER_S))
@@ -255,46 +247,65 @@ class FleetShares:
             if self._tasks:
                 await asyncio.wait(self._tasks.values())
                 self._take_results()
-            await asyncio.to_thread(self._locks.close)
+            await self._in_thread(self._leases.close)
+            self._thread.shutdown(wait=False)
+
+    async def _in_thread(self, work: Callable[..., T], *arguments: object) -> T:
+        """Call a function in the thread of the leases."""
+        return await asyncio.get_running_loop().run_in_executor(self._thread, work, *arguments)
 
     def _check(self) -> None:
-        """Create missing tables and take the lock of all collectors. Raises ServerError, BadArgument."""
+        """Create missing tables and take the lease of this collector. Raises ServerError, BadArgument."""
         PostgresStore(self._url, self._settings).close()
-        self._locks.connect()
+        self._leases.connect()
 
     async def _turn(self) -> None:
         """Take and release shares. Without a database, release all shares."""
         try:
             for number in self._take_results():
-                await asyncio.to_thread(self._locks.release, number)
+                await self._in_thread(self._leases.release, number)
             await self._divide()
+            await self._report_writes()
         except (ServerError, BadArgument) as error:
             if self._problem != str(error):
                 log.warning("%s; this collector has no share until the database is available", error)
             self._problem = str(error)
             self._free = None
             self._stop_runs()
-            await asyncio.to_thread(self._locks.close)
+            await self._in_thread(self._leases.close)
 
     async def _divide(self) -> None:
         """Take free shares and release shares of others. Raises ServerError, BadArgument."""
-        if not self._locks.is_connected:
-            await asyncio.to_thread(self._locks.connect)
+        if not self._leases.is_connected:
+            await self._in_thread(self._check)
         self._problem = ""
-        view = await asyncio.to_thread(self._locks.view)
-        own = {number for number in self._locks.own if number < self._total}
+        view = await self._in_thread(self._leases.view)
+        own = {number for number in self._leases.own if number < self._total}
         todo = changes(self._total, view, own, self._waiting())
         for number in todo.release:
             self._runs[number].stop()
         surplus = () if self._surplus is None or self._surplus in self._waiting() else (self._surplus,)
         for number in (*todo.take, *surplus):
-            if number not in self._locks.own and await asyncio.to_thread(self._locks.take, number):
+            if number not in self._leases.own and await self._in_thread(self._leases.take, number):
                 self._start(Share(number, self._total))
-        self._free = sum(number not in view.held | self._locks.own for number in range(self._total))
+        self._free = sum(number not in view.held | self._leases.own for number in range(self._total))
         if self.live != view.live or todo != Changes():
             self.live = view.live
-            names = ", ".join(map(str, sorted(self._locks.own))) or "none"
+            names = ", ".join(map(str, sorted(self._leases.own))) or "none"
             log.info("shares of %d: %s; running collectors: %d", self._total, names, self.live)
+
+    async def _report_writes(self) -> None:
+        """Log each transaction that is longer than PROBLEM_S, with the sessions that block it. Raises ServerError."""
+        now_ns = self._fleet.now_ns()
+        for number, run in list(self._runs.items()):
+            start_ns = None if run.collector is None else run.collector.write_start_ns
+            if run.write_s(now_ns) < PROBLEM_S or start_ns == run.reported_ns or run.store is None:
+                continue
+            run.reported_ns = start_ns
+            pid = run.store.server_pid
+            sessions = "" if pid is None else await self._in_thread(self._leases.blocking_sessions, pid)
+            cause = f"other sessions hold locks: {sessions}" if sessions else "see pg_stat_activity"
+            log.warning("share %d: PostgreSQL has not stored the messages for %g s; %s", number, PROBLEM_S, cause)
 
     def _start(self, share: Share) -> None:
         run = self._runs[share.number] = _ShareRun(share)
@@ -333,7 +344,7 @@ class FleetShares:
         store.counts = self._counts.setdefault(run.share.number, store.counts)
         try:
             collector = FleetCollector(self._fleet, store, self._selection, run.share, self._times)
-            run.begin(collector)
+            run.begin(collector, store)
             await collector.run()
         finally:
             await asyncio.to_thread(store.close)

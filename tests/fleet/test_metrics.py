@@ -26,7 +26,8 @@ def group(site: str = "mill", version: str = "1", gateways: int = 1, **more: flo
 
 
 NO_TIMES = TransactionTimes()
-IDLE = CollectorStatus(StoreCounts(), NO_TIMES.read(), 0, 0, None, broker_connected=True, database_connected=False)
+IDLE = CollectorStatus(StoreCounts(), NO_TIMES.read(), 0, 0, None, broker_connected=True, database_connected=False,
+                       write_s=0.0)  # fmt: skip
 
 
 def lines(status: CollectorStatus = IDLE, fleet: FleetSnapshot | None = None, age_s: float = 0.0) -> dict[str, float]:
@@ -47,14 +48,21 @@ def test_the_page_has_the_state_of_the_process_and_a_histogram() -> None:
     for seconds in (0.02, 0.025, 0.3, 20.0):
         times.add(seconds)
     status = CollectorStatus(
-        StoreCounts(40, 160, 8, 4), times.read(), 12, 2, 1, broker_connected=False, database_connected=True
+        StoreCounts(40, 160, 8, 4),
+        times.read(),
+        12,
+        2,
+        1,
+        broker_connected=False,
+        database_connected=True,
+        write_s=1.5,
     )
     found = {name.removeprefix(PREFIX): value for name, value in lines(status).items()}
     buckets = {name: found.pop(name) for name in list(found) if "bucket" in name}
     assert found == {
         "messages_total": 40, "rows_total": 160, "duplicates_total": 8, "rejected_total": 4, "waiting_messages": 12,
         "shares": 2, "free_shares": 1, "broker_connected": 0, "database_connected": 1, "transaction_seconds_count": 4,
-        "transaction_seconds_sum": 20.345,
+        "transaction_seconds_sum": 20.345, "transaction_age_seconds": 1.5,
     }  # fmt: skip
     at = {le: buckets[f"transaction_seconds_bucket{{{le}}}"] for le in ("0.01", "0.025", "0.5", "10.0", "+Inf")}
     assert at == {"0.01": 0, "0.025": 2, "0.5": 3, "10.0": 3, "+Inf": 4}

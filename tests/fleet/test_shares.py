@@ -10,9 +10,11 @@ import pytest
 from imud.fleet import reader as fleet_reader
 from imud.fleet import shares
 from imud.fleet.collector import EVERYTHING, FleetCollector, Selection
+from imud.fleet.database.leases import LeaseHolder, LeaseKey, LeaseKind
 from imud.fleet.database.settings import CollectorSettings
+from imud.fleet.database.store import PostgresStore
 from imud.fleet.reader import Fleet
-from imud.fleet.shares import Changes, FleetShares, LockView, ShareLocks, changes
+from imud.fleet.shares import Changes, FleetShares, ShareLeases, ShareView, changes
 from imud.model.errors import BadArgument, ServerError
 from tests.bench.fleet_collectors import play, problems_of
 from tests.fleet.fleet_gateway import SendingGateway, samples_message
@@ -28,7 +30,7 @@ def divided(total: int, *collectors: set[int], turns: int = 10) -> list[set[int]
     own = [set(one) for one in collectors]
     for _ in range(turns):
         for mine in own:
-            view = LockView(len(own), frozenset().union(*own))
+            view = ShareView(len(own), frozenset().union(*own))
             todo = changes(total, view, mine, ())
             mine |= set(todo.take)
             mine -= set(todo.release)
@@ -50,16 +52,17 @@ def test_collectors_divide_the_shares() -> None:
 
 
 def test_a_paused_share_is_left_to_others() -> None:
-    assert changes(3, LockView(2, frozenset({1})), {1}, {0}) == Changes((2,), ())
-    assert changes(2, LockView(2, frozenset({0})), {0}, ()) == Changes((), ()), "the other collector takes share 1"
+    assert changes(3, ShareView(2, frozenset({1})), {1}, {0}) == Changes((2,), ())
+    assert changes(2, ShareView(2, frozenset({0})), {0}, ()) == Changes((), ()), "the other collector takes share 1"
 
 
 live = pytest.mark.live
 
 
 @contextmanager
-def locks(url: str, name: str, selection: Selection = EVERYTHING) -> Iterator[ShareLocks]:
-    with closing(ShareLocks(url, name, selection)) as made:
+def locks(url: str, name: str, selection: Selection = EVERYTHING) -> Iterator[ShareLeases]:
+    PostgresStore(url).close()
+    with closing(ShareLeases(url, name, selection)) as made:
         made.connect()
         yield made
 
@@ -70,35 +73,36 @@ def test_one_collector_at_a_time_has_a_share(server: PostgresServer) -> None:
         with locks(server.url, "a") as second:
             assert [one.take(1) for one in (first, first, second, other)] == [True, True, False, True]
             assert second.take(0)
-            assert first.view() == second.view() == LockView(2, frozenset({0, 1}))
+            assert first.view() == second.view() == ShareView(2, frozenset({0, 1}))
             first.release(1)
             first.release(1)
             assert second.take(1), "a share that was taken twice is released once"
             assert first.own == frozenset()
-        wait_until(lambda: first.view() == LockView(1, frozenset()), "PostgreSQL has released the locks")
-        assert other.view() == LockView(1, frozenset({1}))
+        wait_until(lambda: first.view() == ShareView(1, frozenset()), "PostgreSQL has released the locks")
+        assert other.view() == ShareView(1, frozenset({1}))
 
 
 @live
 def test_collectors_with_one_name_have_one_selection(server: PostgresServer) -> None:
-    mill, third = Selection(site="mill"), ShareLocks(server.url, "c", Selection(gateway="mill"))
+    mill, third = Selection(site="mill"), ShareLeases(server.url, "c", Selection(gateway="mill"))
     expected = pytest.raises(BadArgument, match=r"one selection of gateways.*'c'.*try another --name")
     with closing(third), locks(server.url, "c", mill), locks(server.url, "c", mill), expected:
         third.connect()
 
 
 @live
-def test_a_collector_that_stops_loses_its_shares(server: PostgresServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    """PostgreSQL ends a connection without a statement for IDLE_S. A stopped process keeps its TCP connections open."""
-    assert f"'{shares.IDLE_S * 1000}'" in shares._IDLE
-    monkeypatch.setattr(shares, "_IDLE", shares._IDLE.replace(f"'{shares.IDLE_S * 1000}'", "'500'"))
-    with locks(server.url, "stopped") as stopped:
-        assert stopped.take(0)
-        monkeypatch.undo()
-        with locks(server.url, "stopped") as other:
-            wait_until(lambda: other.take(0), "PostgreSQL has released the locks of the stopped collector")
-            with pytest.raises(ServerError, match="PostgreSQL"):
-                stopped.view()
+def test_stopped_collector_loses_its_shares(server: PostgresServer) -> None:
+    """A stopped process keeps its TCP connections open, but does not renew its leases."""
+    PostgresStore(server.url).close()
+    key = LeaseKey(LeaseKind.SHARE, "stopped", 0)
+    stopped, other = LeaseHolder(server.url, 0.5), LeaseHolder(server.url)
+    with closing(stopped), closing(other):
+        stopped.connect()
+        other.connect()
+        assert stopped.take(key)
+        wait_until(lambda: other.take(key), "the lease of the stopped collector has ended")
+        with pytest.raises(ServerError, match=r"1 of 1 leases ended, .* 0\.5 s|terminating connection|idle-session"):
+            stopped.renew()
 
 
 @live
@@ -185,6 +189,33 @@ async def test_a_lost_database_connection_does_not_end_a_collector(
         await until(lambda: not collector.held)
         await until_stored(database, 20)
         await until(lambda: collector.held == {0, 1})
+
+
+@live
+@pytest.mark.usefixtures("short_turns")
+@in_loop
+async def test_blocked_transaction_is_reported(
+    database: str, broker: Mosquitto, gateway: SendingGateway, monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    """The log names the session that holds a lock. The metrics show the database as not connected."""
+    import psycopg
+
+    monkeypatch.setattr(shares, "PROBLEM_S", 0.3)
+    async with collecting(broker, database) as collector:
+        await until(lambda: collector.held == {0} and subscribed(broker) == 1)
+        with closing(psycopg.connect(database, application_name="editor")) as editor:
+            await asyncio.to_thread(editor.execute, "LOCK TABLE imud_ledger IN EXCLUSIVE MODE")
+            await send(gateway, 1, 20)
+            await until(lambda: "has not stored the messages" in caplog.text)
+            assert "share 0: PostgreSQL has not stored the messages for 0.3 s; other sessions hold" in caplog.text
+            assert f"application 'editor' (SELECT pg_terminate_backend({editor.info.backend_pid}))" in caplog.text
+            status = collector.status()
+            assert not status.database_connected
+            assert status.write_s > 0.3
+        await until_stored(database, 20)
+        await until(lambda: collector.status().database_connected)
+    assert caplog.text.count("has not stored the messages") == 1
 
 
 @live

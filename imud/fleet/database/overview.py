@@ -15,16 +15,15 @@ from typing import Any, Final, NamedTuple, Self
 
 import msgspec
 
+from imud.fleet.database.connection import connected, sentence_of
+from imud.fleet.database.leases import COUNT
 from imud.fleet.database.settings import CollectorSettings
-from imud.fleet.database.store import APPLICATION, connected, sentence_of
 from imud.fleet.database.views import GATEWAY_STATUS
-from imud.fleet.shares import PRESENCE
 from imud.host.installation import needs_extra
 from imud.model.errors import BadArgument, ServerError
 
 STATEMENT_S: Final = 60  # maximum time of a statement, s; 10,000 gateways with 30 streams need less than 1 s
 REASONS_MAX: Final = 20  # maximum number of reasons in `RejectedCounts`
-LEAD: Final = 0x696D7564_6C656164  # key of the advisory lock for the metrics of a fleet, "imudlead"
 SILENT_S: Final = CollectorSettings().silent_s
 
 
@@ -162,12 +161,6 @@ _GROUPS: Final = (
     "count(*) FILTER (WHERE utc_set IS FALSE), sum(missing), sum(dropped), sum(thinned), sum(in_spool), min(silent_s) "
     f"{_SELECTED} GROUP BY 1, 2 ORDER BY 1, 2"
 )
-# `imud.fleet.shares` takes these locks: the second key of a share is its number, other locks have a larger key
-_COLLECTORS: Final = (
-    f"SELECT count(*) FILTER (WHERE objid::bigint >= {PRESENCE}), count(*) FILTER (WHERE objid::bigint < {PRESENCE}) "
-    "FROM pg_locks JOIN pg_stat_activity USING (pid) WHERE locktype = 'advisory' AND granted AND objsubid = 2 AND "
-    f"datname = current_database() AND application_name = '{APPLICATION}'"
-)
 _SIZES: Final = "SELECT (SELECT count(*) FROM imud_ledger), (SELECT count(*) FROM imud_boots)"
 _OF_GATEWAY: Final = "(%(gateway)s::text IS NULL OR split_part(topic, '/', 3) = %(gateway)s)"
 _SINCE: Final = "(%(since_s)s::float8 IS NULL OR rejected_at > now() - make_interval(secs => %(since_s)s))"
@@ -191,7 +184,6 @@ class OverviewReader:
             raise BadArgument("expected the database as a URL like postgresql://USER@HOST/DATABASE")
         with needs_extra("fleet", ServerError):
             import psycopg
-        self._leads = False
         self._error: type[Exception] = psycopg.Error
         self._connection: Any = connected(url)
         self._connection.autocommit = True
@@ -264,15 +256,9 @@ class OverviewReader:
         )
         return (bytes(rows[0][0]), rows[0][1]) if rows else None
 
-    def take_lead(self) -> bool:
-        """Take the lock of the metrics of the fleet, or keep it. Return False if another connection has the lock.
-        Raises ServerError."""
-        self._leads = self._leads or bool(self._rows("SELECT pg_try_advisory_lock(%(lead)s)", {"lead": LEAD})[0][0])
-        return self._leads
-
     def collectors(self) -> RunningCollectors:
         """Return the number of running collectors and of the shares that they hold. Raises ServerError."""
-        return RunningCollectors(*self._rows(_COLLECTORS, {})[0])
+        return RunningCollectors(*self._rows(COUNT, {})[0])
 
     def _rows(self, statement: str, values: Mapping[str, object]) -> Sequence[Any]:
         """Return the rows of a statement. Raises ServerError."""

@@ -17,6 +17,7 @@ from typing import Any, Final, TypeVar
 
 from imud.fleet.accounts import BOOTS_MAX, BootKey, BootOffset
 from imud.fleet.connection import FleetDelivery
+from imud.fleet.database.connection import connected, deadline, sentence_of
 from imud.fleet.database.rows import TableRows, columns_of
 from imud.fleet.database.settings import CollectorSettings
 from imud.fleet.database.transaction import (
@@ -43,15 +44,10 @@ OF_VALUES: Final = ("22", "54")
 # SQLSTATE of conflicts between collectors: serialization failure, deadlock, lock timeout
 OF_CONFLICTS: Final = ("40001", "40P01", "55P03")
 CONFLICTS_MAX: Final = 10  # maximum number of repetitions of a transaction after conflicts
-LOCK_S: Final = 20  # maximum wait for the lock of a row or a table, s
-APPLICATION: Final = "imud fleet collect"  # application_name of the connections of a collector
-CONNECT_S: Final = 10  # maximum time of an attempt to connect, s
 # Number of attempts to connect again, and the pause before each, s. The restart of a server takes some seconds.
 ATTEMPTS: Final = 20
 ATTEMPT_PAUSE_S: Final = 0.5
-# TCP keep-alives of both sides: 5 s + 3 · 3 s until a dead host is detected
-KEEP_ALIVE: Final = {"idle": 5, "interval": 3, "count": 3}
-DEAD_S: Final = 15  # maximum time without an acknowledgement of sent data, s
+TRANSACTION_S: Final = 60  # maximum time of a transaction, s, with waits for locks of rows
 UPKEEP_NS: Final = 60 * NS_PER_S  # interval of the upkeep
 REJECTED_MAX: Final = 10_000  # maximum number of rows in imud_rejected
 PAYLOAD_BYTES: Final = 4096  # maximum length of a payload in imud_rejected
@@ -62,33 +58,6 @@ _FORGET_REJECTED: Final = (
     "DELETE FROM imud_rejected WHERE id IN (SELECT id FROM imud_rejected WHERE id < (SELECT id FROM imud_rejected "
     f"ORDER BY id DESC OFFSET {REJECTED_MAX - 1} LIMIT 1) FOR UPDATE SKIP LOCKED)"
 )
-
-
-def connected(url: str) -> Any:
-    """Connect to a database. Both sides detect a dead host within DEAD_S. Raises ServerError."""
-    import psycopg
-
-    keep_alive: dict[str, Any] = {f"keepalives_{name}": value for name, value in KEEP_ALIVE.items()}
-    try:
-        connection = psycopg.connect(
-            url, connect_timeout=CONNECT_S, application_name=APPLICATION, client_encoding="utf8",
-            tcp_user_timeout=DEAD_S * 1000, **keep_alive,
-        )  # fmt: skip
-        # a statement after a lock must see the rows that the transaction before it stored
-        connection.isolation_level = psycopg.IsolationLevel.READ_COMMITTED
-        with connection.transaction(), connection.cursor() as cursor:
-            for name, value in KEEP_ALIVE.items():
-                cursor.execute(f"SET tcp_keepalives_{name} = {value}".encode())
-            cursor.execute(f"SET tcp_user_timeout = {DEAD_S * 1000}".encode())
-    except psycopg.ProgrammingError as error:
-        if error.sqlstate is not None:  # an error of the server, not of the URL
-            raise ServerError(f"PostgreSQL: {sentence_of(error)}") from error
-        raise ServerError(
-            f"PostgreSQL: cannot parse the URL: {_unquoted(error)}; imud does not show it because of its password"
-        ) from None
-    except psycopg.Error as error:
-        raise ServerError(f"PostgreSQL: {sentence_of(error)}") from error
-    return connection
 
 
 class PostgresStore:
@@ -116,11 +85,11 @@ class PostgresStore:
     def _connect(self) -> None:
         self._connection = connected(self._url)
         try:
-            with self._connection.transaction(), self._connection.cursor() as cursor:
-                cursor.execute(f"SET lock_timeout = '{round(LOCK_S * 1000)}ms'")
-                # release the locks of rows if this process stops within a transaction
-                cursor.execute(f"SET idle_in_transaction_session_timeout = {DEAD_S * 1000}")
-            with self._connection.transaction(), self._connection.cursor() as cursor:
+            with (
+                deadline(self._connection, TRANSACTION_S),
+                self._connection.transaction(),
+                self._connection.cursor() as cursor,
+            ):
                 self._upkeep.prepare(cursor)
         except self._error as error:
             self.close()
@@ -128,6 +97,12 @@ class PostgresStore:
         except ServerError:
             self.close()
             raise
+
+    @property
+    def server_pid(self) -> int | None:
+        """Return the server process of the connection; None while it is closed. Any thread may read it."""
+        connection = self._connection
+        return None if connection.closed else connection.info.backend_pid
 
     def close(self) -> None:
         """Close the connection. A second call does nothing."""
@@ -220,7 +195,11 @@ class PostgresStore:
         """Run a transaction. Repeat it after a conflict with another collector."""
         for attempt in range(CONFLICTS_MAX):
             try:
-                with self._connection.transaction(), self._connection.cursor() as cursor:
+                with (
+                    deadline(self._connection, TRANSACTION_S),
+                    self._connection.transaction(),
+                    self._connection.cursor() as cursor,
+                ):
                     return work(cursor)
             except (self._error, RowRemoved) as error:
                 if isinstance(error, self._error) and _sqlstate(error) not in OF_CONFLICTS:
@@ -286,13 +265,3 @@ def _sqlstate(error: Exception) -> str:
 def _storable(text: str) -> str:
     """Return text that PostgreSQL can store."""
     return text.encode("utf-8", "backslashreplace").decode().replace("\0", "\\0")[:REASON_CHARACTERS]
-
-
-def sentence_of(error: BaseException) -> str:
-    """Return the text of an error as one line."""
-    return " ".join(str(error).split()) or type(error).__name__
-
-
-def _unquoted(error: BaseException) -> str:
-    """Return the problem without the part of the URL that libpq quotes."""
-    return sentence_of(error).partition('"')[0].rstrip(": ")

@@ -3,6 +3,7 @@
     imud_samples, imud_intervals, imud_events, imud_dropped     rows with a time, removed by age
     imud_gateways, imud_boots, imud_ledger                      state and ledger, one row per gateway, boot and stream
     imud_rejected                                               messages that the database could not store
+    imud_leases                                                 running collectors and their shares
     imud_schema                                                 version of the tables
     imud_streams, imud_gateway_status                           views
     imud_intervals_1h, imud_intervals_1d                        views, or continuous aggregates of TimescaleDB
@@ -282,5 +283,20 @@ SCHEMA: Final = FleetTable(
     ),
     ("version",),
 )
+LEASES: Final = FleetTable(
+    "imud_leases",
+    "running collectors, and the shares that they hold",
+    (
+        Column("kind", "text NOT NULL", "collector, share or metrics"),
+        Column("name", "text NOT NULL", "name of the collector; empty for the metrics of the fleet"),
+        Column("number", "bigint NOT NULL", "number of the share; of a collector: its random identifier"),
+        Column("holder", "bigint NOT NULL", "random identifier of the connection that holds the lease"),
+        Column("pid", "integer NOT NULL", "server process of this connection; the lease ends with it"),
+        Column("detail", "text NOT NULL", "selection of the collector; otherwise empty"),
+        Column("expires_at", "timestamptz NOT NULL", "time of the database at which the lease ends"),
+    ),
+    ("kind", "name", "number"),
+    options=" WITH (fillfactor = 50)",
+)
 TIMED: Final = (SAMPLES, INTERVALS, EVENTS, DROPPED)
-TABLES: Final = (*TIMED, GATEWAYS, BOOTS, LEDGER, REJECTED, SCHEMA)
+TABLES: Final = (*TIMED, GATEWAYS, BOOTS, LEDGER, REJECTED, LEASES, SCHEMA)

@@ -8,17 +8,33 @@
 Retention drops whole partitions. Only the end of its boot removes a row without a known time: its wrong time can be
 older than the retention, and the row gets its UTC time later. With TimescaleDB, each of these tables is a hypertable.
 
-Several collectors use one database. Each step of the upkeep is a short transaction under one advisory lock. A step
-waits at most LOCK_MS for a lock of a table, because collectors wait behind it.
+Several collectors use one database. Each step of the upkeep is a short transaction that locks the row of `imud_schema`.
+A user without the right to write to this table cannot lock the row. A step waits at most LOCK_MS for a lock of a table,
+because collectors wait behind it. A user who can read a table can hold such a lock for hours: the log then names the
+sessions.
 """
 
 import logging
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from itertools import chain
 from typing import Any, Final, NamedTuple
 
+from imud.fleet.database.connection import deadline, locking_sessions, sentence_of
+from imud.fleet.database.creation import (
+    check_owners,
+    check_version,
+    create_schema_table,
+    create_table,
+    execute_all,
+    has_license,
+    has_relation,
+    has_timescale,
+    is_hypertable,
+    missing_tables,
+)
 from imud.fleet.database.settings import CollectorSettings
 from imud.fleet.database.tables import (
     BOOTS,
@@ -27,19 +43,18 @@ from imud.fleet.database.tables import (
     LEDGER,
     SAMPLES,
     SCHEMA,
-    SCHEMA_VERSION,
-    TABLES,
     TIMED,
     FleetTable,
 )
 from imud.fleet.database.views import refresh_policies, views
-from imud.model.errors import ServerError
 
 log = logging.getLogger(__name__)
 
-_LOCK: Final = 0x696D7564_75706B70  # number of the advisory lock, "imudupkp"
+_LOCK: Final = f"SELECT FROM {SCHEMA.name} FOR UPDATE"
 PREPARE_S: Final = 20  # maximum wait for another collector that creates the tables, s
 LOCK_MS: Final = 1000  # Maximum wait for a lock of a table, ms. Collectors wait for the same time.
+BLOCKED_MIN: Final = 2  # number of consecutive failures of a step after which the log names the sessions with locks
+STEP_S: Final = 30  # maximum time of a step until the reply arrives, s
 STATEMENT_S: Final = 10  # Maximum time of a statement, s. The collector stores no messages during this time.
 ROWS_STEP: Final = 10_000  # maximum number of rows that a step deletes
 STEPS_MAX: Final = 20  # Maximum number of steps of each kind in one run. The next run continues.
@@ -50,10 +65,6 @@ AHEAD: Final = 2  # number of partitions after the present partition
 # Age of the oldest partition in a new database, hours. The spool of a gateway keeps messages for this time by default.
 BEHIND_H: Final = 168
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
-# First version of TimescaleDB that can delete compressed rows
-_TIMESCALE_MIN: Final = (2, 11)
-# Columns that identify the stream of a row; TimescaleDB compresses the rows of one stream together
-_OF_STREAM: Final = ("gateway", "boot", "device", "stream", "utc_set")
 
 _CHOSEN: Final = "IN (SELECT * FROM unnest(%(gateways)s::text[], %(boots)s::text[]))"
 # the second condition uses the index
@@ -77,6 +88,7 @@ class Upkeep:
         self.expired_incomplete = 0  # number of removed boots with missing numbers
         self._settings = settings
         self._reported: set[str] = set()
+        self._blocked: Counter[str] = Counter()  # consecutive failures of a step because of a lock, by its name
         self._old: list[tuple[str, str]] = []  # gateway and boot of the boots that the present run removes
 
     # --- start --------------------------------------------------------------------------------------------------------
@@ -85,28 +97,27 @@ class Upkeep:
         """Create missing tables, partitions and views in the transaction of `cursor`. If all tables exist, the user
         needs no right to create tables. `now` is the present time; None: the clock of the database. Raises ServerError
         for tables of another version."""
-        import psycopg
-
         cursor.execute(f"SET LOCAL lock_timeout = '{PREPARE_S}s'; SET LOCAL timezone = 'UTC'")
-        cursor.execute("SELECT pg_advisory_xact_lock(%s)", (_LOCK,))
-        _check_version(cursor)
-        missing = [table for table in TABLES if not _exists(cursor, table.name)]
-        with_timescale = _has_timescale(cursor, is_wanted=any(table.is_by_time for table in missing))
-        for table in missing:
-            try:
-                _create(cursor, table, with_timescale=with_timescale)
-            except psycopg.errors.InsufficientPrivilege as error:
-                raise ServerError(
-                    f"PostgreSQL: cannot create the table {table.name}: {error.diag.message_primary}; use a "
-                    "database that the user of the collector owns, or run GRANT CREATE ON SCHEMA public for this user"
-                ) from error
+        check_version(cursor)
+        missing = missing_tables(cursor)
         if SCHEMA in missing:
-            cursor.execute(f"INSERT INTO {SCHEMA.name} (version) VALUES (%s)", (SCHEMA_VERSION,))
-        has_aggregates = _is_hypertable(cursor, INTERVALS) and _has_license(cursor)
+            create_schema_table(cursor)
+        if missing:
+            cursor.execute(_LOCK)
+            missing = missing_tables(cursor)  # another collector can have created the tables before the lock
+        with_timescale = has_timescale(cursor, is_wanted=any(table.is_by_time for table in missing))
+        for table in missing:
+            create_table(cursor, table, with_timescale=with_timescale)
+        check_owners(cursor)
+        self._check_schemas(cursor)
+        has_aggregates = is_hypertable(cursor, INTERVALS) and has_license(cursor)
         for view in views(with_timescale=has_aggregates):
-            if not _exists(cursor, view.name):
-                _execute(cursor, view.statements())
+            if not has_relation(cursor, view.name):
+                execute_all(cursor, view.statements())
         if self._is_owner(cursor):
+            cursor.execute(_LOCK)
+            # a reader can hold locks of tables for hours
+            cursor.execute(f"SET LOCAL lock_timeout = '{LOCK_MS}ms'")
             self._divide(cursor, now or _now(cursor), has_aggregates=has_aggregates)
         if with_timescale:
             # the UTC time of a boot can change more compressed rows than the default limit, 100,000
@@ -115,7 +126,7 @@ class Upkeep:
     def _divide(self, cursor: Any, now: datetime, *, has_aggregates: bool) -> None:
         """Create partitions, or configure hypertables and continuous aggregates."""
         for table in TIMED:
-            if _is_hypertable(cursor, table):
+            if is_hypertable(cursor, table):
                 self._guarded(cursor, f"set the chunks of {table.name}", partial(self._tune, table, cursor))
             elif _is_partitioned(cursor, table):
                 name = f"create partitions of {table.name}"
@@ -124,7 +135,7 @@ class Upkeep:
                 self._report(f"cannot remove old rows of {table.name}: expected partitions, got a plain table")
         if has_aggregates:
             policies = refresh_policies(self._settings.intervals_days)
-            self._guarded(cursor, "set the refresh of hours and days", partial(_execute, cursor, policies))
+            self._guarded(cursor, "set the refresh of hours and days", partial(execute_all, cursor, policies))
 
     def _extend_all(self, table: FleetTable, cursor: Any, now: datetime) -> None:
         # one transaction creates few partitions, because it holds several locks for each of them
@@ -135,7 +146,7 @@ class Upkeep:
         """Set the width of new chunks and the compression of a hypertable."""
         width = timedelta(hours=self._settings.partition_hours)
         cursor.execute("SELECT set_chunk_time_interval(%s::regclass, %s)", (table.name, width))
-        if not _has_license(cursor):
+        if not has_license(cursor):
             return
         days = self._settings.compress_after_days
         after = None if days is None else timedelta(days=days)
@@ -204,23 +215,47 @@ class Upkeep:
             f"SET LOCAL lock_timeout = '{LOCK_MS}ms'; SET LOCAL statement_timeout = '{STATEMENT_S}s'; "
             "SET LOCAL timezone = 'UTC'"
         )
-        cursor.execute("SELECT pg_try_advisory_xact_lock(%s)", (_LOCK,))
-        return bool(cursor.fetchone()[0]) and step(cursor, now or _now(cursor))
+        cursor.execute(f"{_LOCK} SKIP LOCKED")
+        return bool(cursor.rowcount) and step(cursor, now or _now(cursor))
 
     def _guarded(self, cursor: Any, name: str, work: Callable[[], Any]) -> bool:
         """Do work in a transaction. Return its result; False after an error of the database, which goes to the log."""
         import psycopg
 
         try:
-            with cursor.connection.transaction():
-                return bool(work())
+            with deadline(cursor.connection, STEP_S), cursor.connection.transaction():
+                result = bool(work())
+        except psycopg.errors.DeadlockDetected:
+            return False
+        except psycopg.errors.LockNotAvailable:
+            self._blocked[name] += 1
+            if self._blocked[name] >= BLOCKED_MIN:
+                self._report_locks(cursor, name)
+            return False
         except psycopg.Error as error:
             if cursor.connection.closed:
                 raise
-            reason = " ".join(str(error).split())
-            if not isinstance(error, psycopg.errors.LockNotAvailable | psycopg.errors.DeadlockDetected):
-                self._report(f"cannot {name}: {reason}")
+            self._report(f"cannot {name}: {sentence_of(error)}")
             return False
+        self._blocked.pop(name, None)
+        return result
+
+    def _report_locks(self, cursor: Any, name: str) -> None:
+        """Log the sessions that hold locks of the tables."""
+        sessions = locking_sessions(cursor, "imud\\_") or "they have ended"
+        self._report(f"cannot {name}: other sessions hold locks of the tables for a long time: {sessions}")
+
+    def _check_schemas(self, cursor: Any) -> None:
+        """Log the schemas in which every user can create tables and functions."""
+        cursor.execute(
+            "SELECT nspname FROM pg_namespace WHERE nspname = ANY(current_schemas(false)) "
+            "AND has_schema_privilege('public', oid, 'CREATE') ORDER BY nspname"
+        )
+        for (schema,) in cursor.fetchall():
+            self._report(
+                f"every user of the database can create tables and functions in the schema {schema}, and can thereby "
+                f"stop or change the collector; run REVOKE CREATE ON SCHEMA {schema} FROM PUBLIC"
+            )
 
     def _report(self, text: str) -> None:
         """Log a problem once."""
@@ -259,7 +294,7 @@ class Upkeep:
         cut = self._cut(table, now)
         if cut is None:
             return False
-        if _is_hypertable(cursor, table):
+        if is_hypertable(cursor, table):
             return self._retain_chunk(cursor, table, cut)
         if not _is_partitioned(cursor, table):
             return False
@@ -368,108 +403,7 @@ def _now(cursor: Any) -> datetime:
     return found
 
 
-def _execute(cursor: Any, statements: Iterable[str]) -> None:
-    for one in statements:
-        cursor.execute(one)
-
-
-def _exists(cursor: Any, name: str) -> bool:
-    cursor.execute("SELECT to_regclass(%s) IS NOT NULL", (name,))
-    return bool(cursor.fetchone()[0])
-
-
-def _check_version(cursor: Any) -> None:
-    """Raise ServerError if the tables have another version."""
-    cursor.execute(
-        "SELECT attrelid::regclass::text FROM pg_attribute WHERE NOT attisdropped "
-        "AND attname IN ('account', 'content') "
-        "AND attrelid IN (to_regclass('imud_ledger'), to_regclass('imud_records'))"
-    )
-    old = cursor.fetchone()
-    if old is not None:
-        raise ServerError(
-            f"PostgreSQL: expected tables of version {SCHEMA_VERSION}, got {old[0]} of a development version of imud; "
-            "move the old tables to another schema (ALTER SCHEMA public RENAME TO imud_old; CREATE SCHEMA public) or "
-            "use another database"
-        )
-    if _exists(cursor, SCHEMA.name):
-        cursor.execute(f"SELECT max(version) FROM {SCHEMA.name}")
-        version = cursor.fetchone()[0]
-        if version != SCHEMA_VERSION:
-            raise ServerError(
-                f"PostgreSQL: expected tables of version {SCHEMA_VERSION}, got version {version}; install the version "
-                "of imud that created them or use another database"
-            )
-
-
-def _create(cursor: Any, table: FleetTable, *, with_timescale: bool) -> None:
-    """Create a table with its partitions or as a hypertable."""
-    is_partitioned = table.is_by_time and not with_timescale
-    made = table._replace(options=" PARTITION BY LIST (utc_set)") if is_partitioned else table
-    _execute(cursor, made.statements())
-    if not table.is_by_time:
-        return
-    # rows arrive almost in the order of their time: an index of ranges is small and makes queries by time fast
-    cursor.execute(f"CREATE INDEX ON {table.name} USING brin (time) WITH (autosummarize = on)")
-    name = table.name
-    if is_partitioned:
-        cursor.execute(f"CREATE TABLE {name}_unset PARTITION OF {name} FOR VALUES IN (false)")
-        cursor.execute(f"CREATE TABLE {name}_set PARTITION OF {name} FOR VALUES IN (true) PARTITION BY RANGE (time)")
-        cursor.execute(f"CREATE TABLE {name}_other PARTITION OF {name}_set DEFAULT")
-        cursor.execute(f"CREATE INDEX ON {name}_other (time)")
-        return
-    cursor.execute("SELECT create_hypertable(%s::regclass, 'time'::name, create_default_indexes => false)", (name,))
-    cursor.execute(f"CREATE INDEX ON {name} (gateway, boot) WHERE NOT utc_set")
-    if _has_license(cursor):
-        segments = ", ".join(one for one in table.primary if one in _OF_STREAM)
-        order = ", ".join(["time", *(one for one in table.primary if one not in (*_OF_STREAM, "time"))])
-        cursor.execute(
-            f"ALTER TABLE {name} SET (timescaledb.compress, timescaledb.compress_segmentby = '{segments}', "
-            f"timescaledb.compress_orderby = '{order}')"
-        )
-
-
 # --- TimescaleDB ------------------------------------------------------------------------------------------------------
-
-
-def _has_timescale(cursor: Any, *, is_wanted: bool) -> bool:
-    """Return whether the database contains TimescaleDB. If it is wanted, try to create the extension."""
-    import psycopg
-
-    cursor.execute("SELECT installed_version, default_version FROM pg_available_extensions WHERE name = 'timescaledb'")
-    installed, available = cursor.fetchone() or (None, None)
-    version = installed or available
-    if version is None or tuple(map(int, version.split("-")[0].split(".")[:2])) < _TIMESCALE_MIN:
-        return False
-    if installed is not None or not is_wanted:
-        return installed is not None
-    # without shared_preload_libraries, CREATE EXTENSION ends the connection; only the library defines this parameter
-    cursor.execute("SELECT current_setting('timescaledb.disable_load', true)")
-    if cursor.fetchone()[0] is None:
-        return False
-    try:
-        with cursor.connection.transaction():
-            cursor.execute("CREATE EXTENSION timescaledb")
-    except psycopg.Error as error:
-        log.info("PostgreSQL: without TimescaleDB: %s", " ".join(str(error).split()))
-        return False
-    return True
-
-
-def _has_license(cursor: Any) -> bool:
-    """Return whether the license of TimescaleDB allows compression and continuous aggregates."""
-    cursor.execute("SELECT current_setting('timescaledb.license', true)")
-    return bool(cursor.fetchone()[0] == "timescale")
-
-
-def _is_hypertable(cursor: Any, table: FleetTable) -> bool:
-    if not _exists(cursor, "timescaledb_information.hypertables"):
-        return False
-    cursor.execute(
-        "SELECT count(*) > 0 FROM timescaledb_information.hypertables WHERE "
-        "format('%%I.%%I', hypertable_schema, hypertable_name)::regclass = to_regclass(%s)", (table.name,),
-    )  # fmt: skip
-    return bool(cursor.fetchone()[0])
 
 
 def _chunks(cursor: Any, table: FleetTable, cut: datetime) -> Sequence[_Partition]:
@@ -493,7 +427,7 @@ def _has_unset(cursor: Any, chunk: _Partition) -> bool:
 
 
 def _is_partitioned(cursor: Any, table: FleetTable) -> bool:
-    return _exists(cursor, f"{table.name}_set")
+    return has_relation(cursor, f"{table.name}_set")
 
 
 def _partitions(cursor: Any, table: FleetTable) -> Sequence[_Partition]:

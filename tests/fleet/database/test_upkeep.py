@@ -146,7 +146,7 @@ def test_a_user_who_does_not_own_the_tables_gets_one_log_line(
     database: Database, caplog: pytest.LogCaptureFixture
 ) -> None:
     database.query("CREATE ROLE writer; SET ROLE writer")
-    with pytest.raises(ServerError, match=r"cannot create the table imud_samples: permission denied.*GRANT CREATE"):
+    with pytest.raises(ServerError, match=r"cannot create the table imud_schema: permission denied.*GRANT CREATE"):
         database.prepare()
     database.query("RESET ROLE")
     database.prepare()
@@ -320,8 +320,9 @@ def test_one_collector_at_a_time_does_the_upkeep(database: Database) -> None:
     made = database.prepare(samples_days=1)
     database.add(SAMPLES, time=NOW - 5 * DAY)
     with other_connection(database) as other:
-        other.execute("SELECT pg_advisory_xact_lock(%s)", (upkeep._LOCK,))
-        database.run(made)
+        database.query("UPDATE imud_schema SET upkeep_at = NULL")
+        other.execute(upkeep._LOCK)
+        made.run(database.connection.cursor(), NOW)
         other.commit()
     assert database.times() == [NOW - 5 * DAY]
     database.run(made)
