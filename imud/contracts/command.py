@@ -194,6 +194,8 @@ class Verdict:
     done: bool
     words: str  # Values of the device as readable text. A new text after the calibration means a new result.
     progress: float | None = None  # 0 … 1; None if the device does not report its progress
+    has_failed: bool = False  # whether the device reports that the calibration failed
+    bias_t: Vector3 | None = None  # bias of the magnetometer, T; None if the device does not report it
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,6 +264,9 @@ class Calibration:
     begin: Callable[[Target], Any]
     # Returns the script that requests the progress and returns a Verdict; None if `begin` waits for the end
     verdict: Callable[[Target], Any] | None = None
+    # Whether the device reports the state of a calibration that a command started. After the command, the state must
+    # first be neither done nor failed: the device also keeps the state of an earlier calibration.
+    reports_start: bool = False
     # Returns the script that returns a missing precondition, one sentence or empty; None if there is no precondition
     unready: Callable[[Target], Any] | None = None
     expected: tuple[Expectation, ...] = ()  # expected means of the samples at rest after the calibration

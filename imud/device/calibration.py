@@ -9,10 +9,8 @@ The guide checks the newest sample ten times per second. Events report the progr
 import asyncio
 import logging
 from collections import deque
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from itertools import permutations
-from math import atan2, cos, dist, hypot, pi, sin, sqrt
+from collections.abc import Iterable
+from math import atan2, cos, hypot, sin
 from typing import Any, Final
 
 from msgspec.structs import replace
@@ -31,7 +29,17 @@ from imud.contracts.command import (
 )
 from imud.device.health import DeviceEvents
 from imud.device.transport import Transport
-from imud.model.errors import CommandError, ImudError
+from imud.device.turns import (
+    COVERAGE_WANTED,
+    FIELD_MAX_T,
+    FIELD_MIN_T,
+    OFFSET_MAX_T,
+    RESIDUAL_MAX,
+    TURNS_WANTED_RAD,
+    Turning,
+    coverage,
+)
+from imud.model.errors import CommandError, ImudError, NoReply
 from imud.model.event import EventKind
 from imud.model.sample import Pair, Sample, Vector3
 from imud.model.units import NS_PER_S, RAD_PER_DEG, STANDARD_GRAVITY_M_S2, T_PER_UT
@@ -131,170 +139,16 @@ def _circular_mean(angles: Iterable[tuple[float, ...]]) -> tuple[float, ...]:
     return tuple(atan2(sum(sin(one) for one in axis), sum(cos(one) for one in axis)) for axis in axes)
 
 
-_ORDERS: Final = tuple(permutations(range(3)))  # possible orders of the axes by absolute value
-CELLS: Final = 8 * len(_ORDERS)  # number of cells of the sphere: 48
-POINTS_MAX: Final = 1024
-"""Maximum number of points for the coverage. A slow calibration of five minutes has about 700."""
-POINT_DISTANCE_T: Final = 5e-6  # minimum distance of two points, T: an eighth of a cell in Earth's field
-FIT_POINTS_MIN: Final = 12  # minimum number of points for a fit
-STEP_MAX_NS: Final = NS_PER_S  # maximum time between two samples in the integral of the angular rate, ns
-TURNS_WANTED_RAD: Final = 2 * pi  # minimum angle about each axis, rad (manual B, section 8.1.1)
-COVERAGE_WANTED: Final = 0.6
-"""Minimum share of cells. A hand reaches 40 of 48 cells. With fewer than 29 cells the fit depends on noise."""
-FIELD_MIN_T: Final = 22e-6  # minimum of Earth's field at the surface, T (IGRF)
-FIELD_MAX_T: Final = 67e-6  # maximum of Earth's field at the surface, T (IGRF)
-RESIDUAL_MAX: Final = 0.05
-"""Maximum RMS distance from the sphere, as a share of its radius. 5 % change the heading by about 3°."""
-
-
-@dataclass(frozen=True, slots=True)
-class Sphere:
-    """A sphere fitted to the ends of field vectors."""
-
-    centre_t: Vector3
-    radius_t: float
-    residual: float  # RMS distance of the points from the sphere, as a share of the radius
-
-
-class Turning:
-    """Samples of a device that a user turns.
-
-    The fit uses sums over all samples. The coverage uses at most POINTS_MAX points with a distance of at least
-    POINT_DISTANCE_T. Thus memory and computing time have a limit.
-    """
-
-    def __init__(self, *, is_planar: bool = False) -> None:
-        """`is_planar`: the device stays level and turns about one axis only."""
-        self.is_planar = is_planar
-        self._points: list[Vector3] = []
-        self._fit = _SphereFit()
-        self._turned = [0.0, 0.0, 0.0]
-        self._t_ns: int | None = None
-
-    def add(self, sample: Sample) -> None:
-        if sample.mag_t is not None:
-            self._add_field(sample.mag_t)
-        before, self._t_ns = self._t_ns, sample.t_ns
-        if before is None or sample.gyro_rad_s is None or sample.t_ns - before > STEP_MAX_NS:
-            return
-        step_s = (sample.t_ns - before) / NS_PER_S
-        for axis, rate in enumerate(sample.gyro_rad_s):
-            self._turned[axis] += abs(rate) * step_s
-
-    def _add_field(self, field_t: Vector3) -> None:
-        self._fit.add(field_t)
-        if len(self._points) < POINTS_MAX and (not self._points or dist(self._points[-1], field_t) >= POINT_DISTANCE_T):
-            self._points.append(field_t)
-
-    def restart_field(self) -> None:
-        """Remove the field samples: the device now corrects the field in another way."""
-        self._points.clear()
-        self._fit = _SphereFit()
-
-    @property
-    def turned_rad(self) -> Vector3:
-        """Angle about each axis of the sensor, rad, summed over both directions."""
-        x, y, z = self._turned
-        return (x, y, z)
-
-    @property
-    def share(self) -> float:
-        """Share of the wanted turns and, unless `is_planar`, of the wanted directions, 0 … 1."""
-        if self.is_planar:  # a circle in the field has few directions and no sphere
-            return min(1.0, max(self._turned) / TURNS_WANTED_RAD)
-        return min(1.0, coverage(self.cells(self.fit())) / COVERAGE_WANTED, min(self._turned) / TURNS_WANTED_RAD)
-
-    @property
-    def has_field(self) -> bool:
-        """Whether a sample contained a magnetic field."""
-        return bool(self._points)
-
-    def cells(self, sphere: Sphere | None) -> int:
-        """Return the covered cells as a bit mask, seen from the centre of the sphere."""
-        a, b, c = sphere.centre_t if sphere is not None else (0.0, 0.0, 0.0)
-        mask = 0
-        for x, y, z in self._points:
-            mask |= 1 << cell_of((x - a, y - b, z - c))
-        return mask
-
-    def fit(self) -> Sphere | None:
-        """Return the fitted sphere; None if there are too few points or if they lie in a plane."""
-        return self._fit.sphere()
-
-
-class _SphereFit:
-    """Linear least-squares fit of a sphere from sums, in µT for numerical accuracy."""
-
-    def __init__(self) -> None:
-        self._count = 0
-        # products of (2x, 2y, 2z, 1, |m|²): the normal equations with the right side and its square
-        self._sums = [[0.0] * 5 for _ in range(5)]
-
-    def add(self, field_t: Vector3) -> None:
-        x, y, z = (value / T_PER_UT for value in field_t)
-        row = (2 * x, 2 * y, 2 * z, 1.0, x * x + y * y + z * z)
-        self._count += 1
-        for sums, left in zip(self._sums, row, strict=True):
-            for column, right in enumerate(row):
-                sums[column] += left * right
-
-    def sphere(self) -> Sphere | None:
-        if self._count < FIT_POINTS_MIN:
-            return None
-        solved = _solve([list(row) for row in self._sums[:4]])
-        if solved is None:
-            return None
-        a, b, c, d = solved
-        squared = d + a * a + b * b + c * c  # the mean square distance from the centre: positive
-        right_side = [row[4] for row in self._sums]
-        # a point at distance e from the sphere has a residual of about 2 r e in its equation
-        missed = right_side[4] - sum(value * right for value, right in zip(solved, right_side[:4], strict=True))
-        residual = sqrt(max(missed, 0.0) / self._count) / (2 * squared)
-        return Sphere((a * T_PER_UT, b * T_PER_UT, c * T_PER_UT), sqrt(squared) * T_PER_UT, residual)
-
-
-def cell_of(direction: Vector3) -> int:
-    """Return the cell of a direction, 0 … 47: its octant, then the order of the absolute values."""
-    octant = sum((value < 0) << axis for axis, value in enumerate(direction))
-    order = tuple(sorted(range(3), key=lambda axis: -abs(direction[axis])))
-    return octant * len(_ORDERS) + _ORDERS.index(order)
-
-
-def coverage(mask: int) -> float:
-    """Return the share of the cells in the mask."""
-    return mask.bit_count() / CELLS
-
-
-def _solve(matrix: Sequence[list[float]]) -> list[float] | None:
-    """Solve four linear equations with the right sides in the fifth column; None if they are singular.
-
-    Gaussian elimination with partial pivoting. Changes `matrix`.
-    """
-    scale = max(abs(value) for row in matrix for value in row[:4])
-    for i in range(4):
-        pivot = max(range(i, 4), key=lambda row: abs(matrix[row][i]))
-        if abs(matrix[pivot][i]) <= 1e-9 * scale:
-            return None
-        rows = list(matrix)
-        rows[i], rows[pivot] = rows[pivot], rows[i]
-        matrix = rows
-        for row in matrix[i + 1 :]:
-            factor = row[i] / matrix[i][i]
-            for j in range(i, 5):
-                row[j] -= factor * matrix[i][j]
-    found = [0.0] * 4
-    for i in reversed(range(4)):
-        known = sum(matrix[i][j] * found[j] for j in range(i + 1, 4))
-        found[i] = (matrix[i][4] - known) / matrix[i][i]
-    return found
-
-
 log = logging.getLogger(__name__)
 
 REST_LIMIT_NS: Final = 20 * NS_PER_S  # maximum wait for the rest of the device, ns
 TURN_LIMIT_NS: Final = 300 * NS_PER_S  # maximum time for the turns, ns. The manual specifies one to two minutes.
 REPORT_NS: Final = NS_PER_S // 2  # interval of progress events, ns
 ASK_NS: Final = 3 * NS_PER_S  # interval of queries during the turns, ns. Each query can cost some samples.
+START_LIMIT_NS: Final = 10 * NS_PER_S
+"""Time in which a device must report the calibration that imud started, ns: three queries and a lost reply."""
+UNSTARTED_LIMIT_NS: Final = 30 * NS_PER_S  # maximum time of the turns if the device does not report a start, ns
+LOST_REPLIES_MAX: Final = 5  # maximum number of queries in sequence without a reply: 15 s
 SETTLE_NS: Final = 2 * NS_PER_S
 """Time between the end and the verification, ns: the attitude filter of the device needs it."""
 
@@ -340,7 +194,7 @@ class CalibrationRun:
         if self._running is not None:
             raise CommandError("another calibration of this device is running")
         if save and calibration.kept is not Kept.BY_SAVE:
-            raise CommandError(f"{kind}: cannot save: the result lasts {calibration.kept}")
+            raise CommandError(f"{kind}: {_SAVE_REFUSALS[calibration.kept]}; repeat the command without --save")
         limit_ns = None if calibration.handling is Handling.REST else TURN_LIMIT_NS
         self.status = CalibrationStatus(kind, "", self._now_ns, limit_ns, REQUESTED_BY.get())
         self.is_sent = False
@@ -376,7 +230,7 @@ class CalibrationRun:
         else:
             device, checks, problem = await self._turned(kind, calibration)
         problem = problem or _failed(checks)
-        if self._resets != resets:
+        if self._resets != resets and not problem:  # the clock can also count a pause of the samples as a restart
             problem = "the device restarted during the calibration; check its power supply and repeat the calibration"
         saved = calibration.kept is Kept.BY_DEVICE and not problem
         if save and not problem and calibration.save is not None:
@@ -417,9 +271,13 @@ class CalibrationRun:
         before = verdict = await self._transport.run_script(ask) if ask is not None else Verdict(done=False, words="")
         self.is_sent = True
         await self._transport.run_script(calibration.begin)
-        turning, begun_ns = Turning(is_planar=calibration.handling is Handling.SPIN), self._now_ns
-        report_ns = ask_ns = begun_ns
+        turning = Turning(is_planar=calibration.handling is Handling.SPIN)
+        begun_ns = report_ns = ask_ns = self._now_ns
+        lost_replies = 0
+        # The end of an earlier calibration is not evidence: after it, the device must report a running calibration.
+        has_run = not (calibration.reports_start and (before.done or before.has_failed))
         problem = "the device did not finish the calibration"
+
         while self._now_ns - begun_ns < TURN_LIMIT_NS:
             now_ns, sample = await self._next()
             if sample is not None:
@@ -429,16 +287,34 @@ class CalibrationRun:
                 self._report_turning(kind, turning, verdict)
             if ask is not None and now_ns >= ask_ns:
                 ask_ns = now_ns + ASK_NS
-                last, verdict = verdict, await self._transport.run_script(ask)
+                last = verdict
+                try:
+                    verdict = await self._transport.run_script(ask)
+                    lost_replies = 0
+                except NoReply as error:
+                    lost_replies += 1
+                    log.info("%s: %s: no reply to the query: %s", self._events.device, kind, error)
+                    if lost_replies >= LOST_REPLIES_MAX:
+                        raise
                 if verdict.words != last.words:
                     turning.restart_field()
-            if verdict.done and turning.share >= 1.0 and (verdict.words != before.words or before.done):
-                problem = ""
+                has_run = has_run or not (verdict.done or verdict.has_failed)
+            if not has_run:
+                if _is_unstarted(now_ns - begun_ns, turning):
+                    return verdict.words, _field_checks(turning, verdict), _unstarted(turning, verdict)
+                continue
+            if verdict.has_failed:
+                advice = _advice(turning, _field_checks(turning, verdict))
+                words = f"the device reports that the calibration failed: {verdict.words}; {advice}"
+                return verdict.words, _field_checks(turning, verdict), words
+            is_new = calibration.reports_start or verdict.words != before.words or before.done
+            if verdict.done and turning.share >= 1.0 and is_new:
+                problem = _offset_problem(turning, verdict)
                 self._report_turning(kind, turning, verdict)
-                break
-        checks = _field_checks(turning)
-        if problem:
-            problem = f"{problem} within {TURN_LIMIT_NS // NS_PER_S} s; {_advice(turning, checks)}"
+                return verdict.words, _field_checks(turning, verdict), problem
+
+        checks = _field_checks(turning, verdict)
+        problem = f"{problem} within {TURN_LIMIT_NS // NS_PER_S} s; {_advice(turning, checks)}"
         return verdict.words, checks, problem
 
     # --- samples -----------------------------------------------------------------------------------------------------
@@ -516,6 +392,13 @@ class CalibrationRun:
         )  # fmt: skip
 
 
+OFFSET_NAME: Final = "offset of the field"
+_SAVE_REFUSALS: Final = {
+    Kept.BY_DEVICE: "a save is not necessary, because the device saves the result itself",
+    Kept.NEVER: "the device cannot save the result, which lasts until power-off",
+}
+
+
 def check(expectation: Expectation, means: RestMeans) -> Check:
     """Compare the means of the samples with an expectation."""
     value = expectation.value(means)
@@ -526,9 +409,13 @@ def _bounded(name: str, value: float | None, limit: float, unit: str) -> Check:
     return Check(name, value, limit, unit, value is not None and value <= limit)
 
 
-def _field_checks(turning: Turning) -> tuple[Check, ...]:
+def _field_checks(turning: Turning, verdict: Verdict) -> tuple[Check, ...]:
+    offset_t = turning.offset(verdict.bias_t)
+    length_t = None if offset_t is None else hypot(*offset_t)
+    offset = _bounded(OFFSET_NAME, length_t, OFFSET_MAX_T, "T")
     if turning.is_planar:
-        return ()
+        return (offset,)
+
     sphere = turning.fit()
     if sphere is None:
         return (Check("residual of the field", None, RESIDUAL_MAX, "", False),)
@@ -536,6 +423,33 @@ def _field_checks(turning: Turning) -> tuple[Check, ...]:
     return (
         _bounded("residual of the field", sphere.residual, RESIDUAL_MAX, ""),
         Check("field strength", sphere.radius_t, high, "T", low <= sphere.radius_t <= high),
+        offset,
+    )
+
+
+def _offset_problem(turning: Turning, verdict: Verdict) -> str:
+    """Return that the bias of the device does not fit the measured field; empty if it fits."""
+    offset_t = turning.offset(verdict.bias_t)
+    if offset_t is None or hypot(*offset_t) <= OFFSET_MAX_T:
+        return ""
+    shown = ", ".join(f"{value / T_PER_UT:.1f}" for value in offset_t)
+    return (
+        f"the bias of the device does not fit the measured field: expected an offset of at most "
+        f"{OFFSET_MAX_T / T_PER_UT:g} µT, got {shown} µT; repeat the calibration"
+    )
+
+
+def _is_unstarted(duration_ns: int, turning: Turning) -> bool:
+    """Return whether imud stops to wait for the start of the calibration. The complete turns show the offset."""
+    return duration_ns >= UNSTARTED_LIMIT_NS or (duration_ns >= START_LIMIT_NS and turning.share >= 1.0)
+
+
+def _unstarted(turning: Turning, verdict: Verdict) -> str:
+    """Return that the device did not start the calibration, and the measured offset."""
+    offset = _offset_problem(turning, verdict) if turning.share >= 1.0 else ""
+    return (
+        f"the device accepted the start, but expected a running calibration, got “{verdict.words}” of an earlier "
+        f"calibration; {offset or 'restart the device and repeat the calibration'}"
     )
 
 

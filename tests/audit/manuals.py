@@ -249,7 +249,7 @@ B 6.2.2 source address | any | drivers.hipnuc.j1939.codec:HOST_ADDRESS
 B 7 NMEA 2000 | heading, rate of turn, attitude by the standard | drivers.hipnuc.nmea2000:measurement_of
 B 8.1.1 procedure | steps and conditions | drivers.hipnuc.common:TURNING
 B 8.1.1 result | bias of MAGCONFIG, zero before | drivers.hipnuc.uart.settings:report_values
-B 8.1.2 disturbance | a field that does not turn with the module | device.calibration:RESIDUAL_MAX
+B 8.1.2 disturbance | a field that does not turn with the module | device.turns:RESIDUAL_MAX
 B 8.1.3 in the background | collects, calibrates, saves by itself | sim.hipnuc.uart_settings:SelfCalibration
 B 8.2 EN_MCAL | in the background or not | drivers.hipnuc.uart.commands:magnetic_calibration
 B 8.2 once | calibrate, then off and saved | drivers.hipnuc.uart.driver:CALIBRATIONS

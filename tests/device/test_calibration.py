@@ -2,10 +2,11 @@
 Coverage, turns and the fitted sphere for points with known results."""
 
 import asyncio
+import re
 from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import replace
 from itertools import permutations, product
-from math import pi, radians, remainder
+from math import cos, pi, radians, remainder, sin
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -13,10 +14,11 @@ import pytest
 
 from imud.contracts.command import GYRO_ZERO, Calibration, CalibrationResult, Handling, Kept, Target, Verdict
 from imud.contracts.lines import DeviceLines
-from imud.device.calibration import CalibrationRun, RestWindow, Turning, _field_checks, _words, cell_of, coverage
+from imud.device.calibration import CalibrationRun, RestWindow, _field_checks, _words
 from imud.device.health import DeviceEvents
 from imud.device.transport import Transport
-from imud.model.errors import BadArgument, CommandError, Rejected
+from imud.device.turns import Turning, cell_of, coverage
+from imud.model.errors import BadArgument, CommandError, NoReply, Rejected
 from imud.model.event import Event, EventKind
 from imud.model.ledger import Ledger
 from imud.model.sample import Pair, Sample, Sync, Vector3
@@ -218,7 +220,7 @@ async def test_no_samples_and_refusals(rig: GuideRig) -> None:
         await rig.guide.run("gyro", gyro(rig), save=False)
     assert rig.clock.now_ns() >= 1020 * NS_PER_S
     rig.silent = False
-    with pytest.raises(CommandError, match="heading: cannot save: the result lasts until power-off"):
+    with pytest.raises(CommandError, match="heading: the device cannot save the result"):
         await rig.guide.run("heading", gyro(rig, kept=Kept.NEVER), save=True)
     with pytest.raises(CommandError, match="gyro: set the mode first"):
         await rig.guide.run("gyro", gyro(rig, unready=rig.does("ready?", "set the mode first")), save=False)
@@ -283,13 +285,16 @@ async def test_the_turns_end_when_the_device_reports_the_end(rig: GuideRig) -> N
 
     def verdict() -> Verdict:
         done = rig.clock.now_ns() > 1060 * NS_PER_S
-        return Verdict(done, "bias 14.1, -2.1, -8.8 µT" if done else "bias 0, 0, 0 µT")
+        if done:  # this device sends the field without its bias
+            return Verdict(done, "bias 14.1, -2.1, -8.8 µT", bias_t=HARD_IRON_T)
+        return Verdict(done, "bias 0, 0, 0 µT", bias_t=(0.0, 0.0, 0.0))
 
     result = await rig.guide.run("magnetometer", magnetometer(rig, verdict), save=False)
     assert result.verified
     assert result.saved
     assert result.device == "bias 14.1, -2.1, -8.8 µT"
-    residual, field = result.checks
+    residual, field, offset = result.checks
+    assert offset.value == pytest.approx(0.0, abs=1e-9)
     assert residual.value == pytest.approx(0.0, abs=1e-6)
     assert field.value == pytest.approx(45.1e-6, rel=1e-3)
     assert rig.clock.now_ns() > 1060 * NS_PER_S
@@ -387,12 +392,107 @@ async def test_magnetometer_by_a_command_with_the_progress_of_the_device(
     result = await it.device.calibrate(kind, save=False)
     assert result.verified, result.problem
     assert result.device == "bias 14.14, -2.08, -8.75 µT, STATE DONE"
-    assert len(result.checks) == (0 if kind == "magnetometer_2d" else 2)
+    assert [check.name for check in result.checks][-1] == "offset of the field"
+    assert len(result.checks) == (1 if kind == "magnetometer_2d" else 3)
     steps = [event.detail for event in it.events if event.detail.get("phase") == "turn"]
     shown = [cast(float, step["device_progress"]) for step in steps]
     assert shown == sorted(shown) or shown[0] == 1.0  # the first query can be before the start
     assert (steps[-1]["progress"], shown[-1]) == (1.0, 1.0)
     assert any(0.0 < one < 1.0 for one in shown)
+
+
+@pytest.mark.parametrize(
+    ("variant", "words"),
+    [
+        ("calibration ignored", "expected a running calibration, got “bias 0, 0, 0 µT, STATE DONE” of an earlier"),
+        ("calibration without bias", "the bias of the device does not fit the measured field: expected an offset of"),
+        (
+            "calibration fails",
+            "the device reports that the calibration failed: bias 0, 0, 0 µT, STATE FAILED",
+        ),
+    ],
+)
+@pytest.mark.parametrize(
+    ("kind", "motion"), [("magnetometer_start", ByHand(5.0)), ("magnetometer_2d", OnTheSpot())], ids=["3D", "2D"]
+)
+@played(lambda variant, words, kind, motion: module(motion, 0, variant))
+async def test_calibration_without_evidence_is_not_verified(
+    it: WiredDevice, variant: str, words: str, kind: str, motion: Motion
+) -> None:
+    """The device replies OK to the start in each case. The words do not depend on the time limit of the turns."""
+    await it.wait(2)
+    start_ns = it.clock.now_ns()
+    result = await it.device.calibrate(kind, save=False)
+    assert (result.verified, result.saved) == (False, False)
+    assert words in result.problem
+    assert it.clock.now_ns() - start_ns < 100 * NS_PER_S
+    assert "restarted" not in result.problem
+    if variant != "calibration fails":
+        shown = re.search(r"at most 3 µT, got (.*), (.*), (.*) µT", result.problem)
+        assert shown is not None
+        x_ut, y_ut, z_ut = (float(value) for value in shown.groups())
+        expected = (14.14, -2.08, 0.0 if kind == "magnetometer_2d" else -8.75)
+        assert (x_ut, y_ut, z_ut) == pytest.approx(expected, abs=0.1)
+
+
+@pytest.mark.parametrize("earlier", [Verdict(True, "STATE DONE"), Verdict(False, "STATE FAILED", has_failed=True)])
+@played(lambda earlier: GuideRig())
+async def test_end_of_earlier_calibration_needs_running_state(rig: GuideRig, earlier: Verdict) -> None:
+    turned_by_hand(rig)
+    calibration = magnetometer(rig, lambda: earlier, reports_start=True)
+    result = await rig.guide.run("magnetometer", calibration, save=False)
+    assert not result.verified
+    assert f"got “{earlier.words}” of an earlier calibration" in result.problem
+    assert rig.clock.now_ns() < 1032 * NS_PER_S
+
+    start_ns = rig.clock.now_ns()
+
+    def verdict() -> Verdict:
+        is_running = 2 * NS_PER_S < rig.clock.now_ns() - start_ns < 30 * NS_PER_S
+        return Verdict(False, "STATE RUNNING") if is_running else Verdict(True, "STATE DONE")
+
+    calibration = magnetometer(rig, verdict, reports_start=True)
+    assert (await rig.guide.run("magnetometer", calibration, save=False)).verified
+
+
+@played(GuideRig)
+async def test_lost_replies_do_not_end_the_turns(rig: GuideRig) -> None:
+    turned_by_hand(rig)
+    queries: list[int] = []
+
+    def verdict() -> Verdict:
+        queries.append(rig.clock.now_ns())
+        if 3 <= len(queries) <= lost_until:
+            raise NoReply("LOG MCAL STAT: expected OK, got no reply")
+        return Verdict(len(queries) > 12, f"bias {len(queries) > 12}")
+
+    lost_until = 6
+    assert (await rig.guide.run("magnetometer", magnetometer(rig, verdict), save=False)).verified
+    queries.clear()
+    lost_until = 7
+    with pytest.raises(NoReply, match="got no reply"):
+        await rig.guide.run("magnetometer", magnetometer(rig, verdict), save=False)
+
+
+@pytest.mark.parametrize(
+    ("kept", "words"),
+    [
+        (Kept.BY_DEVICE, "x: a save is not necessary, because the device saves the result itself; repeat the command"),
+        (Kept.NEVER, "x: the device cannot save the result, which lasts until power-off; repeat the command"),
+    ],
+)
+@played(lambda kept, words: GuideRig())
+async def test_needless_save_is_refused_with_the_next_step(rig: GuideRig, kept: Kept, words: str) -> None:
+    with pytest.raises(CommandError, match=f"^{words} without --save$"):
+        await rig.guide.run("x", gyro(rig, kept=kept), save=True)
+
+
+@pytest.mark.parametrize("kind", ["magnetometer_start", "magnetometer_2d"])
+@played(lambda kind: module(ByHand(5.0) if kind == "magnetometer_start" else OnTheSpot(), 0, "lost replies"))
+async def test_calibration_with_lost_replies_is_verified(it: WiredDevice, kind: str) -> None:
+    await it.wait(2)
+    result = await it.device.calibrate(kind, save=False)
+    assert result.verified, result.problem
 
 
 @played(lambda: module(Still(0.05, -0.03, 0.4), 1))
@@ -578,7 +678,7 @@ def test_sphere_of_six_points_and_points_without_a_sphere() -> None:
     assert flattened.radius_t == pytest.approx(43.4e-6, abs=1e-8)
     assert flattened.residual == pytest.approx(0.0532, abs=1e-4)
     for radius_t, passed in ((21.9e-6, False), (22.1e-6, True), (66.9e-6, True), (67.1e-6, False)):
-        residual, strength = _field_checks(of(axes(radius_t, radius_t)))
+        residual, strength, _ = _field_checks(of(axes(radius_t, radius_t)), Verdict(True, ""))
         assert (residual.limit, residual.passed) == (0.05, True)
         assert (strength.limit, strength.passed) == (67e-6, passed)
     for apart_t, points in ((4.9e-6, 1), (5.1e-6, 2)):
@@ -587,6 +687,42 @@ def test_sphere_of_six_points_and_points_without_a_sphere() -> None:
     plane: list[Vector3] = [(4e-5 * x, 4e-5 * y, 0.0) for x, y in circle]
     for without in ([], [(1e-6, 0.0, 0.0)] * 50, plane * 4, [(0.0, 0.0, 0.0)] * 50):
         assert of(without).fit() is None, without[:6]
+
+
+def test_offset_of_the_field() -> None:
+    """3D: a sphere about CENTRE. 2D: a circle about a tilted axis; the part along the axis is not an offset."""
+    sphere = of(axes(45e-6))
+    assert sphere.offset(None) == pytest.approx(CENTRE)
+    assert sphere.offset((0.0, 0.0, 0.0)) == pytest.approx(CENTRE)
+    assert sphere.offset(CENTRE) == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)  # the field without the bias
+
+    for axis, u, v in (
+        ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+        ((0.0, 0.6, 0.8), (1.0, 0.0, 0.0), (0.0, 0.8, -0.6)),
+    ):
+        circle = Turning(is_planar=True)
+        assert circle.offset(None) is None
+        for number in range(80):
+            angle = number * pi / 20
+            height = 40e-6 + 1e-6 * (number % 3)  # the vehicle rocks
+            x, y, z = (
+                30e-6 * a + 20e-6 * (cos(angle) * b + sin(angle) * c) + 7e-6 * b - 5e-6 * c + height * a
+                for a, b, c in zip(axis, u, v, strict=True)
+            )
+            sign = 1 if number < 40 else -1  # the vehicle turns back
+            gyro_x, gyro_y, gyro_z = (sign * pi / 2 * value for value in axis)
+            circle.add(turned(number * 100 * NS_PER_MS, (x, y, z), (gyro_x, gyro_y, gyro_z)))
+        assert circle.share == 1.0
+        offset_t = circle.offset((0.0, 0.0, 0.0))
+        assert offset_t is not None
+        a, b, c = (7e-6 * left - 5e-6 * right for left, right in zip(u, v, strict=True))
+        assert offset_t == pytest.approx((a, b, c), abs=2e-7)
+        x, y, z = axis
+        without_bias_t = circle.offset((a + 9e-6 * x, b + 9e-6 * y, c + 9e-6 * z))
+        assert without_bias_t == pytest.approx((0.0, 0.0, 0.0), abs=2e-7)
+        circle.restart_field()
+        assert circle.share == 0.0
+        assert circle.offset(None) is None
 
 
 def test_turns_and_bounded_memory() -> None:

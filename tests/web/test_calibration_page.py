@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from imud.client.connection import Client
-from imud.device.calibration import COVERAGE_WANTED
+from imud.device.turns import COVERAGE_WANTED
 from imud.formats.jsonrpc import RpcError
 from tests.support.daemon_process import LIMIT_S, RunningDaemon
 from tests.web.browser import MISSING, TOKEN, Page, log_in, open_page, serving_web

@@ -13,7 +13,7 @@ import pytest
 from msgspec.json import decode
 from selenium.webdriver.common.keys import Keys
 
-from imud.device.calibration import cell_of
+from imud.device.turns import cell_of
 from imud.web.hub import row_of
 from imud.web.messages import encode
 from tests.support.daemon_process import RunningDaemon, running_daemon, wait_until

@@ -27,16 +27,15 @@ from math import degrees, pi, radians
 from random import Random
 from typing import Any, Final
 
-from imud.drivers.hipnuc.uart.codec import encode_frame, encode_hi91, encode_hi92
+from imud.drivers.hipnuc.uart.codec import encode_hi91, encode_hi92
 from imud.drivers.hipnuc.uart.commands import BAUD_RATES, FRAME_BYTES, MAX_RATE_HZ, OutputMessage
-from imud.drivers.hipnuc.uart.ins import WEEK_MS, hi83_size, pack_hi81, pack_hi83
+from imud.drivers.hipnuc.uart.ins import hi83_size
 from imud.formats.nmea0183 import sentence
 from imud.model.sample import Vector3
 from imud.model.units import NS_PER_MS, NS_PER_S, NS_PER_US, T_PER_UT
 from imud.sim.hipnuc.boot_loader import Application, Flash, KbootLoader
-from imud.sim.hipnuc.ins import ins_values
+from imud.sim.hipnuc.ins import encode_ins
 from imud.sim.hipnuc.uart_settings import (
-    NO_UTC,
     NWU,
     VARIANTS,
     CommandRefused,
@@ -151,22 +150,6 @@ PPS_MODULUS_MS: Final = 8192  # Modulus of the PPS time without edges, ms. A rec
 NEAR_LEVEL_RAD: Final = radians(5)  # maximum tilt at which ATT RST 3 acts, rad
 _PRINTABLE = range(0x20, 0x7F)
 INS_FIRMWARE: Final = 170  # default firmware of a device with HI81 or HI83
-NAVIGATING: Final = 3  # INS status
-GPS_WEEK: Final = 2453
-
-
-def encode_ins(message: OutputMessage, reading: Truth, hi83_bitmap: int, device_ns: int, status: int) -> bytes:
-    """Return an HI81 or HI83 frame. The device always has a position and UTC."""
-    values = ins_values(reading, device_ns)
-    status &= ~NO_UTC
-    if message is OutputMessage.HI81:
-        weeks, tow_ms = divmod(device_ns // NS_PER_MS, WEEK_MS)
-        payload = pack_hi81(values, main_status=status, ins_status=NAVIGATING, week=GPS_WEEK + weeks, tow_ms=tow_ms)
-    else:
-        payload = pack_hi83(
-            values, hi83_bitmap, main_status=status, ins_status=NAVIGATING, system_time_us=device_ns // NS_PER_US
-        )
-    return encode_frame(payload)
 
 
 class HipnucModule:
@@ -186,7 +169,10 @@ class HipnucModule:
         self._pins = HipnucPins()
         self._random = Random(self.hardware.mark_seed)
         self._line = bytearray()
-        self._magnetometer = SelfCalibration(self.hardware.hard_iron_t, self.hardware.mag_bias_t)
+        self._lost_replies = set(self.hardware.behaviour.loses)
+        self._magnetometer = SelfCalibration(
+            self.hardware.hard_iron_t, self.hardware.mag_bias_t, self.hardware.behaviour.calibration
+        )
         self.memory = Flash(Application(self.hardware.product, self.hardware.firmware))
         self.loader: KbootLoader | None = None  # active boot loader; None while the application runs
         self._actions = self._make_actions()
@@ -286,6 +272,8 @@ class HipnucModule:
         settings, application = self.settings, self.memory.application(self.hardware.product)
         if application is not None and application.version != self.hardware.firmware:
             self.hardware = replace(self.hardware, firmware=application.version)
+            if baud := self.hardware.baud_after_update:
+                self.flash = self.settings = settings = replace(settings, baud=baud)
             self._actions = self._make_actions()
         hardware, self.loader = self.hardware, None
         if application is None or waits:
@@ -435,10 +423,16 @@ class HipnucModule:
         except CommandRefused:
             self._say(["ERR"], now_ns)
             return
-        if reply is not None:
+        if reply is not None and not self._loses_reply(line):
             self._say([*reply, "OK"], now_ns + behaviour.flash_ms * NS_PER_MS * (line in WRITES_FLASH))
             if line.startswith("SERIALCONFIG") and behaviour.rate_change is RateChange.AFTER_ANSWER:
                 self._rate_at_ns = self._wire.due_ns(now_ns, 0) + RATE_CHANGE_NS
+
+    def _loses_reply(self, line: str) -> bool:
+        """Return whether the reply to this command is lost: only the first reply."""
+        prefixes = [prefix for prefix in self._lost_replies if line.startswith(prefix)]
+        self._lost_replies.difference_update(prefixes)
+        return bool(prefixes)
 
     def _change(self, settings: ModuleSettings, now_ns: int) -> None:
         """Apply the settings that a command changed."""
@@ -514,7 +508,7 @@ class HipnucModule:
                 self._calibrates = True
                 return []
             case ["LOG", "MCAL", "STAT"] if behaviour.newer:
-                state = "RUNNING" if self._calibrates and not self._magnetometer.finished else "DONE"
+                state = self._magnetometer.state_text(is_started=self._calibrates)
                 return [f"STATE={state}", f"PROGRESS={100 * self._magnetometer.progress:.0f}%"]
             case ["LOG", "INSCONFIG"] if behaviour.ins:
                 return [f"BASELINE={self.settings.baseline_m:g}"]

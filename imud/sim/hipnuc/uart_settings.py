@@ -37,6 +37,15 @@ class ResetEffect(Enum):
     BEFORE_ANSWER = "before answer"  # all settings immediately: the reply has the rate of the factory
 
 
+class CalibrationFault(Enum):
+    """Faults of the calibration that CONFIG MCAL START starts. Each fault still replies OK to the command."""
+
+    NONE = "none"
+    IGNORED = "ignored"  # the device does nothing, and still reports the state of an earlier calibration
+    NO_BIAS = "no bias"  # the device reports RUNNING and then DONE, and its bias stays 0
+    FAILS = "fails"  # the device reports RUNNING and then FAILED
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Behaviour:
     """One interpretation of the manual."""
@@ -51,6 +60,9 @@ class Behaviour:
     # Firmware 1.6.9 and newer: COORD, URFR by digits, MCAL, two ports, NMEA sentences between the lines of a reply,
     # `system_time` modulo 24 h, ERR for unknown commands. The lines of its reports are assumptions.
     newer: bool = False
+    calibration: CalibrationFault = CalibrationFault.NONE
+    # First words of commands. The reply to the first command with these words is lost on the wire.
+    loses: tuple[str, ...] = ()
     older: bool = False  # codes of older firmware: ZARU, ABW, ARG, GBW, GRG, INC_FMT, and ATT RST 1 and 4
     ins: bool = False  # messages and commands of INS models; the device does not send these messages
 
@@ -69,6 +81,10 @@ VARIANTS: Final[Mapping[str, Behaviour]] = {
     "magnetometer refused": Behaviour(refuses=("LOG MAGCONFIG",)),
     "quiet after an answer": Behaviour(quiet_ms=700),
     "firmware 1.7": Behaviour(newer=True, firmware=170),
+    "calibration ignored": Behaviour(newer=True, firmware=170, calibration=CalibrationFault.IGNORED),
+    "calibration without bias": Behaviour(newer=True, firmware=170, calibration=CalibrationFault.NO_BIAS),
+    "calibration fails": Behaviour(newer=True, firmware=170, calibration=CalibrationFault.FAILS),
+    "lost replies": Behaviour(newer=True, firmware=170, loses=("LOG MCAL STAT", "CONFIG MCAL START", "CONFIG IMU")),
     "INS, firmware 1.7": Behaviour(newer=True, ins=True, firmware=170),
     "older firmware": Behaviour(older=True, firmware=120),
     "all at once": Behaviour(
@@ -447,6 +463,7 @@ class HipnucHardware(SensorHardware):
     product: str = "HI14R3"
     build: str = "Oct 15 2024"
     uuid: str = "043995698D6E1708"
+    baud_after_update: int = 0  # baud rate that an update of the firmware sets, bit/s; 0: unchanged
     firmware: int = 156
     bootloader: int = 109
     mark_spread_ns: int = MARK_SPREAD_NS  # maximum deviation of the processing time after an edge on SIN, ns
@@ -491,9 +508,10 @@ _NO_TURN: Final[Vector3] = (0.0, 0.0, 0.0)
 class SelfCalibration:
     """Bias of one magnetometer, and the part of it that the device knows."""
 
-    def __init__(self, hard_iron_t: Vector3, found_t: Vector3) -> None:
+    def __init__(self, hard_iron_t: Vector3, found_t: Vector3, fault: CalibrationFault = CalibrationFault.NONE) -> None:
         """`hard_iron_t`: field of parts that turn with the device; `found_t`: the part that the device knows."""
         self._hard_iron_t = hard_iron_t
+        self._fault = fault
         self.found_t = found_t
         self.finished = any(found_t)  # True after a calibration
         self._turned: Vector3 = _NO_TURN
@@ -512,6 +530,8 @@ class SelfCalibration:
 
     def restart(self, *, planar: bool) -> None:
         """Start a calibration by a command. `planar`: a turn about one axis is enough."""
+        if self._fault is CalibrationFault.IGNORED:
+            return
         self.finished, self.found_t, self._turned, self._planar = False, _NO_TURN, _NO_TURN, planar
 
     def sample(self, device_ns: int, gyro_rad_s: Vector3) -> None:
@@ -526,7 +546,17 @@ class SelfCalibration:
         x, y, z = (turned + abs(rate) * step_s for turned, rate in zip(self._turned, gyro_rad_s, strict=True))
         self._turned = (x, y, z)
         if self.progress >= 1.0:
-            self.finished, self.found_t, self._turned = True, self._hard_iron_t, _NO_TURN
+            self.finished, self._turned = True, _NO_TURN
+            if self._fault is CalibrationFault.NONE:
+                self.found_t = self._hard_iron_t
+
+    def state_text(self, *, is_started: bool) -> str:
+        """Return the state of LOG MCAL STAT. `is_started`: a command has started a calibration since power-on."""
+        if not is_started or self._fault is CalibrationFault.IGNORED:
+            return "DONE"
+        if not self.finished:
+            return "RUNNING"
+        return "FAILED" if self._fault is CalibrationFault.FAILS else "DONE"
 
     def measured(self, field_t: Vector3) -> Vector3:
         """Return the field that the device sends: the field with the unknown part of the bias."""

@@ -48,6 +48,7 @@ BaudRate = Literal[115200, 921600, 460800, 256000, 230400, 9600]
 # Baud rates of SERIALCONFIG (section 2.2.3) and 230400 of table 3.7; the factory value first
 BAUD_RATES: Final[tuple[BaudRate, ...]] = get_args(BaudRate)
 REPLY_TIMEOUT_NS: Final = NS_PER_S // 2
+NEWER_FIRMWARE: Final = 169  # first firmware that replies ERR to an unknown command, 1.6.9
 FLASH_TIMEOUT_NS: Final = 5 * NS_PER_S  # erasing the flash can take more than 2 s; the manual states no time
 
 OutputRate = Literal[0, 1, 2, 4, 5, 8, 10, 20, 25, 40, 50, 100, 125, 200, 250, 500, 1000]
@@ -382,18 +383,37 @@ def send(request: Request) -> RequestScript[None]:
 
 def send_if_known(request: Request) -> RequestScript[tuple[str, ...]]:
     """Send a command that some firmware does not know, and return the lines of its reply. Raises NoReply, Rejected."""
-    outcome = yield request
-    if not isinstance(outcome, Reply):
-        raise Rejected((yield from not_supported(request, outcome)))
-    return outcome.lines
+    return (yield from require_known(request, (yield request)))
 
 
-def not_supported(request: Request, outcome: Outcome) -> RequestScript[str]:
-    """Return the error for a command without a positive reply, with the firmware version. Raises NoReply if the device
-    does not reply at all."""
+def require_known(request: Request, outcome: Outcome) -> RequestScript[tuple[str, ...]]:
+    """Return the lines of a positive reply to a command that some firmware does not know.
+
+    After no reply, the version shows that the device replies at all, and the second request distinguishes a lost reply
+    from an unknown command: newer firmware replies ERR to an unknown command. Raises NoReply, Rejected.
+    """
+    if isinstance(outcome, Reply):
+        return outcome.lines
+    firmware = (yield from identify()).firmware
+    if isinstance(outcome, Silence):
+        outcome = yield request
+    if isinstance(outcome, Reply):
+        return outcome.lines
+
+    if isinstance(outcome, Silence) and _rejects_unknown_commands(firmware):
+        raise NoReply(
+            f"{request.name}: expected OK or ERR, got no reply, but firmware {firmware} replies to other commands; "
+            "repeat the command"
+        )
     got = " / ".join(outcome.lines) if isinstance(outcome, Rejection) else "no reply"
-    firmware = (yield from identify()).firmware or "of unknown version"
-    return f"{request.name}: not supported by firmware {firmware}: expected OK, got {got}"
+    version = firmware or "of unknown version"
+    raise Rejected(f"{request.name}: not supported by firmware {version}: expected OK, got {got}")
+
+
+def _rejects_unknown_commands(firmware: str) -> bool:
+    """Return whether this firmware replies ERR to an unknown command. `firmware`: `1.7.0`."""
+    digits = firmware.replace(".", "")
+    return digits.isdecimal() and int(digits) >= NEWER_FIRMWARE
 
 
 # --- output -----------------------------------------------------------------------------------------------------------
@@ -460,7 +480,7 @@ def wake_by_force(baud: int) -> RequestScript[str]:
 def restart(present_baud: int = 0) -> RequestScript[Identity]:
     """Restart the device and wait until it replies. Unsaved settings are lost, also a baud rate. Raises NoReply."""
     yield reboot()
-    identity, _ = yield from _found_after_boot([present_baud])
+    identity, _ = yield from find_after_boot([present_baud])
     return identity
 
 
@@ -480,7 +500,7 @@ def change_baud(baud: BaudRate, present_baud: int) -> RequestScript[int]:
         yield from _require_reported_baud(baud, present_baud)
     yield from send(save_config())
     yield reboot()
-    _, heard = yield from _found_after_boot((baud, present_baud))
+    _, heard = yield from find_after_boot((baud, present_baud))
     if heard != baud:
         raise Rejected(f"SERIALCONFIG {baud}: the device keeps {heard} baud")
     return heard
@@ -508,7 +528,7 @@ def reset_to_factory(present_baud: int) -> RequestScript[int]:
     if not answered and heard == present_baud:
         raise NoReply("FRESET: expected OK, got no reply; read the settings to check the result")
     yield reboot()
-    _, heard = yield from _found_after_boot((FACTORY_BAUD, present_baud))
+    _, heard = yield from find_after_boot((FACTORY_BAUD, present_baud))
     return heard
 
 
@@ -538,7 +558,7 @@ def find(bauds: Sequence[int]) -> RequestScript[int]:
     raise NoReply(f"LOG VERSION: expected a reply at {rates} baud, got none; `baud: auto` tries all rates")
 
 
-def _found_after_boot(bauds: Sequence[int]) -> RequestScript[tuple[Identity, int]]:
+def find_after_boot(bauds: Sequence[int]) -> RequestScript[tuple[Identity, int]]:
     """Wait for a reply after a restart, at the likely baud rates first, then at all others. Raises NoReply.
 
     An unsaved baud rate is lost by a restart, and the saved baud rate is not known.

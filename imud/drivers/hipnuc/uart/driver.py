@@ -25,7 +25,7 @@ from imud.contracts.command import (
     yaw_at,
 )
 from imud.contracts.driver import Identity, StreamDriver, random_vector
-from imud.contracts.script import Reply, RequestScript, Silence
+from imud.contracts.script import RequestScript, Silence
 from imud.drivers.hipnuc.common import (
     FLOATS,
     MAIN_STATUS,
@@ -75,9 +75,9 @@ from imud.drivers.hipnuc.uart.settings import (
     shown,
     why_silent,
 )
-from imud.model.errors import NoReply
+from imud.model.errors import NoReply, Rejected
 from imud.model.sample import Measurement, Position
-from imud.model.units import NS_PER_MS
+from imud.model.units import NS_PER_MS, T_PER_UT
 
 Message = Annotated[OutputMessage, Meta(extra={"section": "2.2.5"})]
 DEGREES_PER_TURN: Final = 360.0
@@ -219,7 +219,8 @@ def _magnetometer_verdict(_target: Target) -> RequestScript[Verdict]:
     if bias is None:
         return Verdict(done=False, words="the device does not report its bias")
     words = "bias " + ", ".join(f"{value:g}" for value in bias) + " µT"
-    return Verdict(done=any(bias), words=words)
+    x, y, z = (value * T_PER_UT for value in bias)
+    return Verdict(done=any(bias), words=words, bias_t=(x, y, z))
 
 
 def _keep_magnetometer(_target: Target) -> RequestScript[None]:
@@ -236,16 +237,22 @@ def _start(planar: bool) -> Callable[[Target], RequestScript[object]]:
 
 
 def _started_verdict(target: Target) -> RequestScript[Verdict]:
-    """Read the bias, and the state of a calibration that a command started. Raises NoReply, Rejected."""
+    """Read the state of a calibration that a command started, then its bias. Raises NoReply, Rejected.
+
+    A bias that imud reads before the state can be older than the end of the calibration.
+    """
+    state = yield from firmware.calibration_state()
     bias = yield from _magnetometer_verdict(target)
-    return (yield from firmware.calibration_state(bias.words))
+    return replace(state, words=", ".join(filter(None, (bias.words, state.words))), bias_t=bias.bias_t)
 
 
 def _calibration_unknown(_target: Target) -> RequestScript[str]:
     """Return why the firmware cannot start a calibration by a command; empty if it can."""
-    request = firmware.ask_calibration()
-    outcome = yield request
-    return "" if isinstance(outcome, Reply) else (yield from commands.not_supported(request, outcome))
+    try:
+        yield from commands.send_if_known(firmware.ask_calibration())
+    except Rejected as error:
+        return str(error)
+    return ""
 
 
 _MAGNETOMETER: Final = magnetometer(_start_magnetometer, _magnetometer_verdict, _nine_axes_needed)
@@ -265,6 +272,7 @@ CALIBRATIONS: Final[Calibrations] = {
         section=firmware.SOURCE,
         begin=_start(planar=False),
         verdict=_started_verdict,
+        reports_start=True,
         unready=_calibration_unknown,
     ),
     "magnetometer_2d": replace(
@@ -272,9 +280,14 @@ CALIBRATIONS: Final[Calibrations] = {
         help="measure the horizontal magnetic field of a vehicle by a command of newer firmware, with its progress",
         section=firmware.SOURCE,
         handling=Handling.SPIN,
-        instructions=(TURNING[0], "Turn the vehicle slowly, level and in one place: at least one full turn."),
+        instructions=(
+            TURNING[0],
+            "Turn the vehicle slowly, level and in one place: at least two full turns. The second turn verifies the "
+            "result.",
+        ),
         begin=_start(planar=True),
         verdict=_started_verdict,
+        reports_start=True,
         unready=_calibration_unknown,
     ),
     **levels("2.2.4", 5, lambda kind: lambda _target: send(commands.level_reset(kind)), _save),

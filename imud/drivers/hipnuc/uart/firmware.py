@@ -22,12 +22,12 @@ from msgspec import Meta
 
 from imud.attitude.rotation import Matrix3, is_rotation
 from imud.contracts.command import Target, Verdict
-from imud.contracts.script import Reply, Request, RequestScript
+from imud.contracts.script import Request, RequestScript
 from imud.contracts.setting import Setting
 from imud.drivers.hipnuc.uart import commands
 from imud.drivers.hipnuc.uart.commands import BaudRate, Query, command, number_text, send_if_known
 from imud.drivers.hipnuc.uart.replies import PeriodicOutputs, numbers_of, parse_report, whole
-from imud.model.errors import BadArgument, Rejected
+from imud.model.errors import BadArgument
 
 ON_MARK: Final = "on_mark"
 SOURCE: Final = "not in V1.5.9"  # section of a setting that the manual does not contain
@@ -82,7 +82,9 @@ def mounting_by_digits(digits: str) -> Request:
 
 # Words in the state of LOG MCAL STAT (assumption). imud shows other states and does not verify the calibration.
 _DONE: Final = re.compile(r"(?<![A-Z])(?:DONE|FINISH(?:ED)?|COMPLETED?|SUCCESS|CALIBRATED)(?![A-Z])", re.IGNORECASE)
-_FAILED: Final = re.compile(r"FAIL|ERR|ABORT|TIMEOUT|(?<![A-Z])NOT(?![A-Z])", re.IGNORECASE)
+_FAILED: Final = re.compile(r"FAIL|ERR|ABORT|TIMEOUT", re.IGNORECASE)
+_NOT: Final = re.compile(r"(?<![A-Z])NOT(?![A-Z])", re.IGNORECASE)
+_NO_FAULT: Final = ("0", "NO", "NONE", "OK")  # values of a field such as ERROR without a fault (assumption)
 _PERCENT: Final = re.compile(r"(\d{1,3}(?:\.\d*)?)\s*%?")
 MCAL_STAT: Final = "MCAL STAT"
 
@@ -97,8 +99,8 @@ def ask_calibration() -> Request:
     return commands.ask_lines(MCAL_STAT)
 
 
-def read_calibration(lines: Sequence[str], bias: str) -> Verdict:
-    """Return the state in the lines of LOG MCAL STAT. `bias` is the present bias as text."""
+def read_calibration(lines: Sequence[str]) -> Verdict:
+    """Return the state in the lines of LOG MCAL STAT."""
     report = parse_report(lines)
     progress, states = None, []
     for name, text in (*report.values.items(), *(("", line) for line in report.other)):
@@ -108,14 +110,15 @@ def read_calibration(lines: Sequence[str], bias: str) -> Verdict:
         else:
             states.append(f"{name} {text}".strip())
     state = ", ".join(states)
-    has_failed = _FAILED.search(state) is not None
-    done = not has_failed and (_DONE.search(state) is not None or (not states and progress == 1.0))
-    return Verdict(done, ", ".join(filter(None, (bias, state))), progress)
+    has_failed = any(_FAILED.search(text) and text.split()[-1].upper() not in _NO_FAULT for text in states)
+    is_end = _DONE.search(state) is not None or (not states and progress == 1.0)
+    done = is_end and not has_failed and _NOT.search(state) is None
+    return Verdict(done, state, progress, has_failed)
 
 
-def calibration_state(bias: str) -> RequestScript[Verdict]:
+def calibration_state() -> RequestScript[Verdict]:
     """Read the state of the calibration. Raises NoReply, Rejected."""
-    return read_calibration((yield from send_if_known(ask_calibration())), bias)
+    return read_calibration((yield from send_if_known(ask_calibration())))
 
 
 # --- several ports ----------------------------------------------------------------------------------------------------
@@ -140,8 +143,7 @@ def send_port_baud(port: str, baud: int, present_baud: int) -> RequestScript[Non
             yield command(f"SERIALCONFIG {name} {present_baud}")
             yield from commands.find((present_baud, baud))
             raise BadArgument(f"port_baud.{port}: imud uses {name}; imud restored {present_baud} baud: use `baud`")
-    if not isinstance(outcome, Reply):
-        raise Rejected((yield from commands.not_supported(request, outcome)))
+    yield from commands.require_known(request, outcome)
 
 
 def has_all(declared: Mapping[str, Any], actual: Mapping[str, Any]) -> bool:

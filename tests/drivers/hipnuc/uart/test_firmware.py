@@ -102,6 +102,34 @@ def test_a_firmware_without_the_command_is_named(version: str, name: str, given:
         line.run(setting.write(Target(None, line.baud), msgspec.convert(given, setting.type)))
 
 
+def write(name: str, line: HipnucLine, value: Any) -> Any:
+    setting = SETTINGS.table[name]
+    assert setting.write is not None
+    return setting.write(Target(None, line.baud), value)
+
+
+LOSSES: list[tuple[str, Any]] = [
+    ("LOG MCAL STAT", lambda line: send_if_known(f.ask_calibration())),
+    ("CONFIG MCAL START", lambda line: CALIBRATIONS["magnetometer_start"].begin(Target(None, line.baud))),
+    ("LOG COM2", lambda line: write("port_output", line, {"com2": {"hi91": 10}})),
+    ("SERIALCONFIG COM2", lambda line: write("port_baud", line, {"com2": 921600})),
+]
+
+
+@pytest.mark.parametrize(("command", "make"), LOSSES, ids=[command for command, _ in LOSSES])
+def test_lost_reply_is_no_missing_command(command: str, make: Any) -> None:
+    """A lost reply does not show that the firmware lacks the command: imud sends the command again."""
+    line = line_of(Behaviour(newer=True, firmware=172, loses=(command,)))
+    line.run(make(line))
+    assert sum(asked.startswith(command) for asked in line.asked) == 2
+
+
+def test_newer_firmware_without_a_reply_has_the_command() -> None:
+    line = line_of(Behaviour(newer=True, firmware=172, ignores=("LOG MCAL STAT",)))
+    with pytest.raises(NoReply, match=r"expected OK or ERR, got no reply, but firmware 1\.7\.2 replies to"):
+        line.run(send_if_known(f.ask_calibration()))
+
+
 def test_a_command_without_any_reply_of_the_device_is_no_missing_command() -> None:
     line = line_of(NEWER)
     line.connected = False
@@ -194,19 +222,22 @@ def test_verbs_of_older_firmware_and_ins_models() -> None:
 
 
 STATES: list[tuple[list[str], Verdict]] = [
-    (["STATE=RUNNING", "PROGRESS=45%"], Verdict(False, "b, STATE RUNNING", 0.45)),
-    (["STATE=DONE", "PROGRESS=100%"], Verdict(True, "b, STATE DONE", 1.0)),
-    (["MCAL: FINISHED"], Verdict(True, "b, MCAL FINISHED")), (["100%"], Verdict(True, "b", 1.0)),
-    (["PROG: 7"], Verdict(False, "b", 0.07)), (["STATE=NOT CALIBRATED"], Verdict(False, "b, STATE NOT CALIBRATED")),
-    (["STATE=FAILED", "PROGRESS=100"], Verdict(False, "b, STATE FAILED", 1.0)),
-    (["RESULT=UNCALIBRATED"], Verdict(False, "b, RESULT UNCALIBRATED")),
-    (["STAT=2"], Verdict(False, "b, STAT 2")),  # a form that imud does not know: shown, not verified
+    (["STATE=RUNNING", "PROGRESS=45%"], Verdict(False, "STATE RUNNING", 0.45)),
+    (["STATE=DONE", "PROGRESS=100%"], Verdict(True, "STATE DONE", 1.0)),
+    (["MCAL: FINISHED"], Verdict(True, "MCAL FINISHED")), (["100%"], Verdict(True, "", 1.0)),
+    (["PROG: 7"], Verdict(False, "", 0.07)), (["STATE=NOT CALIBRATED"], Verdict(False, "STATE NOT CALIBRATED")),
+    (["STATE=NOT DONE"], Verdict(False, "STATE NOT DONE")),
+    (["STATE=FAILED", "PROGRESS=100"], Verdict(False, "STATE FAILED", 1.0, has_failed=True)),
+    (["STATE=RUNNING", "ERROR=0"], Verdict(False, "STATE RUNNING, ERROR 0")),
+    (["STATE=DONE", "ERROR=7"], Verdict(False, "STATE DONE, ERROR 7", has_failed=True)),
+    (["RESULT=UNCALIBRATED"], Verdict(False, "RESULT UNCALIBRATED")),
+    (["STAT=2"], Verdict(False, "STAT 2")),  # a form that imud does not know: shown, not verified
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("lines", "verdict"), STATES)
 def test_states_of_a_calibration(lines: list[str], verdict: Verdict) -> None:
-    assert f.read_calibration([*lines, "OK"], "b") == verdict
+    assert f.read_calibration([*lines, "OK"]) == verdict
 
 
 @pytest.mark.parametrize("planar", [False, True])
@@ -230,7 +261,9 @@ def test_a_calibration_by_command_reports_its_progress(planar: bool) -> None:
     for half_s in (11, 12):
         magnetometer.sample(half_s * NS_PER_S // 2, spin if planar else (2.0, 2.0, 2.0))
     verdict = line.run(calibration.verdict(target))
-    assert verdict == Verdict(True, "bias 14.14, -2.08, -8.75 µT, STATE DONE", 1.0)
+    assert (verdict.done, verdict.words) == (True, "bias 14.14, -2.08, -8.75 µT, STATE DONE")
+    assert verdict.bias_t == pytest.approx(iron)
+    assert line.asked[-2:] == ["LOG MCAL STAT", "LOG MAGCONFIG"], "the bias is not older than the state"
     old = HipnucLine(ModuleSettings(att_mode=1))
     assert old.run(calibration.unready(target)) == (
         "LOG MCAL STAT: not supported by firmware 1.5.6: expected OK, got no reply"
