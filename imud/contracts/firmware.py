@@ -10,7 +10,7 @@ import msgspec
 from imud.contracts.codec import CodecEvent
 from imud.contracts.command import Target
 from imud.contracts.script import Request, RequestScript
-from imud.model.errors import BadArgument, CommandError
+from imud.model.errors import BadArgument, CommandError, Rejected
 from imud.model.ledger import Ledger
 
 IMAGE_BYTES_MAX: Final = 1 << 20  # Maximum length of an image, bytes. The microcontrollers have at most 1 MiB of flash.
@@ -67,6 +67,11 @@ class LostContact(CommandError):
     """The boot loader did not reply, or replied with damaged frames. A new transfer of the image can succeed."""
 
 
+class EraseRefused(Rejected):
+    """The boot loader refused the first erase of an update, and imud requested the start of the old application. Only a
+    reply of the application shows that the flash memory is unchanged."""
+
+
 Report = Callable[[str, int, int], None]
 """Reports the progress: the phase, and the number of bytes of all bytes that the device confirmed."""
 
@@ -92,12 +97,15 @@ class Firmware:
     """Update of the firmware by one driver."""
 
     # Returns the script that writes the image and starts the new firmware. Before it erases the flash memory, the
-    # script reports the phase ERASE. Raises BadArgument, Rejected, LostContact.
+    # script reports the phase ERASE. Raises BadArgument, EraseRefused, Rejected, LostContact.
     update: Callable[[Target, FirmwareImage, Report], RequestScript[None]]
     # Request that only the boot loader answers, for the options of the driver
     ping: Callable[[Any], Request]
     # Makes the decoder of the replies; None if the codec of the driver returns the replies
     make_codec: Callable[[Ledger], BootLoaderCodec] | None = None
+    # Returns the script that searches for the application at all baud rates, keeps its baud rate, and returns the
+    # necessary change of the configuration, empty if none is necessary. None: the link has no baud rate
+    find: Callable[[Target], RequestScript[str]] | None = None
 
 
 FLASH_STARTS: Final = (0x0000_0000, 0x0800_0000)

@@ -10,6 +10,7 @@ tool.
 
 import struct
 from binascii import crc32, crc_hqx
+from enum import Enum
 from typing import Final, NamedTuple
 
 from imud.drivers.hipnuc.canopen.cia301 import ABORT, WRITTEN
@@ -35,10 +36,21 @@ PACKET_BYTES: Final = 256  # maximum payload of a data packet
 WINDOW_NS: Final = 600 * NS_PER_MS  # time after a restart in which a ping stops the start of the application
 GAP_NS: Final = 100 * NS_PER_MS  # pause after which the boot loader discards an incomplete packet
 OUT_OF_RANGE, WRONG_COMMAND = 10200, 10000  # status of a command (assumption)
+CUMULATIVE_WRITE, NO_START = 10203, 10101  # status after data that the flash memory refused, and of a reset
+WRONG_STATE: Final = 0x0800_0022  # abort code: not possible in the present state
 TOGGLE_ERROR, NO_OBJECT, BAD_COMMAND, TOO_LONG = 0x0503_0000, 0x0602_0000, 0x0504_0001, 0x0607_0012
 # Mark, product, version, and length of an image of this simulator. Its CRC-32 follows the last byte.
 _HEAD: Final = struct.Struct("<8s16sII")
 _MARK: Final = b"SIMIMG\0\0"
+
+
+class LoaderFault(Enum):
+    """Faults of a boot loader that acknowledges every packet."""
+
+    NONE = "none"
+    REFUSES_ERASE = "refuses erase"  # UART: status 10200; CANopen: abort 0x06070012. Nothing is erased.
+    REFUSES_DATA = "refuses data"  # UART: final status 10203; CANopen: no fault
+    REFUSES_START = "refuses start"  # UART: status 10101 of the reset; CANopen: abort 0x08000022
 
 
 class Application(NamedTuple):
@@ -62,6 +74,7 @@ class Flash:
 
     def __init__(self, application: Application) -> None:
         self._application: Application | None = application
+        self.fault = LoaderFault.NONE
         self.data = bytearray()  # written bytes, from `APPLICATION`
         self.erased = 0  # number of erase operations
 
@@ -152,7 +165,9 @@ class KbootLoader:
         self._left -= len(payload)
         replies.append(bytes([kboot.START_BYTE, kboot.ACK]))
         if not self._left:
-            replies.append(kboot.command(kboot.TAG_GENERIC, 0, kboot.TAG_WRITE))
+            status = CUMULATIVE_WRITE if self._flash.fault is LoaderFault.REFUSES_DATA else 0
+            # one write: both replies arrive in the same bytes
+            replies[-1] += kboot.command(kboot.TAG_GENERIC, status, kboot.TAG_WRITE)
 
     def _command(self, payload: bytes, replies: list[bytes]) -> None:
         self._left = 0  # a command ends a transfer of data
@@ -166,14 +181,17 @@ class KbootLoader:
             replies.append(kboot.command(kboot.TAG_PROPERTY_REPLY, status, self._properties.get(first, 0)))
             return
         if tag in (kboot.TAG_ERASE, kboot.TAG_WRITE):
-            if first != APPLICATION or not 0 < second <= FLASH_START + FLASH_BYTES - APPLICATION:
+            is_refused = tag == kboot.TAG_ERASE and self._flash.fault is LoaderFault.REFUSES_ERASE
+            if is_refused or first != APPLICATION or not 0 < second <= FLASH_START + FLASH_BYTES - APPLICATION:
                 status = OUT_OF_RANGE
             elif tag == kboot.TAG_ERASE:
                 self._flash.erase()
             else:
                 self._left = second
         elif tag == kboot.TAG_RESET:
-            self.wants_reset = True
+            if self._flash.fault is LoaderFault.REFUSES_START:
+                status = NO_START
+            self.wants_reset = not status
         else:
             status = WRONG_COMMAND
         replies.append(kboot.command(kboot.TAG_GENERIC, status, tag))
@@ -188,7 +206,7 @@ class SdoLoader:
         self._toggle = 0
         self.wants_reset = False
 
-    def serve(self, data: bytes) -> bytes:
+    def serve(self, data: bytes) -> bytes:  # noqa: PLR0911 - one return for each abort code
         """Process an SDO request of eight bytes. Return the data of the reply; empty without a reply."""
         command, address = data[0], data[1:4]
         if command == ABORT:
@@ -202,12 +220,15 @@ class SdoLoader:
         sub = address[2]
         if command == BEGIN_DOWNLOAD and sub == IMAGE:
             size = int.from_bytes(data[4:], "little")
-            if not 0 < size <= FLASH_START + FLASH_BYTES - APPLICATION:
+            is_refused = self._flash.fault is LoaderFault.REFUSES_ERASE
+            if is_refused or not 0 < size <= FLASH_START + FLASH_BYTES - APPLICATION:
                 return _abort(address, TOO_LONG)
             self._flash.erase()
             self._left, self._toggle = size, 0
         elif sub not in (ENTER_LOADER, CONFIRM, START_APPLICATION):
             return _abort(address, BAD_COMMAND)
+        if sub == START_APPLICATION and self._flash.fault is LoaderFault.REFUSES_START:
+            return _abort(address, WRONG_STATE)
         self.wants_reset = sub == START_APPLICATION
         return bytes([ENTERED if sub == ENTER_LOADER else WRITTEN]) + address + bytes(4)
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from imud.contracts.codec import BadFrame, message_of
 from imud.contracts.command import Target
-from imud.contracts.firmware import ERASE, Firmware, FirmwareImage, LostContact, check_product
+from imud.contracts.firmware import ERASE, EraseRefused, Firmware, FirmwareImage, LostContact, check_product
 from imud.contracts.script import Outcome, Reply, ReplyFrame, Request
 from imud.drivers.hipnuc.canopen.driver import DRIVER as CANOPEN
 from imud.drivers.hipnuc.canopen.firmware import FIRMWARE as ON_CAN
@@ -21,7 +21,7 @@ from imud.drivers.hipnuc.uart.kboot import FIRMWARE as ON_UART
 from imud.model.errors import BadArgument, CommandError, LinkError, Rejected
 from imud.model.ledger import Ledger
 from imud.sim.can_module import SentFrame
-from imud.sim.hipnuc.boot_loader import APPLICATION, FLASH_BYTES, FLASH_START, make_image
+from imud.sim.hipnuc.boot_loader import APPLICATION, FLASH_BYTES, FLASH_START, LoaderFault, make_image
 from tests.support.simulated_modules import CanopenBench, HipnucLine, run_script, unpack
 
 FAULTS = ("lost request", "damaged request", "lost reply", "damaged reply", "power", "cable")
@@ -65,8 +65,15 @@ class UartBench(HipnucLine):
         self.faults, self.target = Faults(), Target(None, self.baud)
         self.application = self.codec
         self.loader = kboot.KbootCodec(self.ledger)
+        self.durations_ns: list[int] = []  # time of each request
 
     def ask(self, request: Request) -> Outcome:
+        start_ns = self.now_ns
+        outcome = self._exchange(request)
+        self.durations_ns.append(self.now_ns - start_ns)
+        return outcome
+
+    def _exchange(self, request: Request) -> Outcome:
         self.faults.begin(request)
         if self.faults.present == "power":
             self.module.reboot(self.now_ns)
@@ -80,10 +87,13 @@ class UartBench(HipnucLine):
             times = (self.module.next_ns(), self.session.deadline_ns)
             self.now_ns = max(self.now_ns, min(one for one in times if one is not None))
             for burst in self.module.advance(self.now_ns):
+                outcome: Outcome | None = None
                 for event in self.loader.feed(self.faults.on_reply(burst.data)):
                     message = message_of(event)
-                    if message is not None and (outcome := self.session.on_message(message, self.now_ns)):
-                        return outcome
+                    if message is not None:  # as in the daemon, messages after the outcome belong to no request
+                        outcome = self.session.on_message(message, self.now_ns) or outcome
+                if outcome is not None:
+                    return outcome
             assert self.ledger.closes(), self.ledger.snapshot()
             if outcome := self.session.on_time(self.now_ns):
                 return outcome
@@ -272,6 +282,63 @@ def test_boot_loader_that_rejects_the_image_erases_nothing(make: Any, address: i
     with pytest.raises(error):
         update(bench, FirmwareImage(address, bytes(size)))
     assert bench.module.memory.erased == 0
+
+
+@pytest.mark.parametrize(("make", "code"), [(UartBench, "got 10200"), (CanUpdateBench, "0x06070012")])
+def test_refused_erase_starts_the_application_again(make: Any, code: str) -> None:
+    bench = make()
+    before = bench.version()
+    bench.module.memory.fault = LoaderFault.REFUSES_ERASE
+    with pytest.raises(EraseRefused, match=code):
+        update(bench)
+    assert bench.module.memory.erased == 0
+    assert bench.version() == before
+
+
+@pytest.mark.parametrize("make", BENCHES)
+def test_erase_refused_after_a_lost_transfer_is_not_unchanged(make: Callable[[], Bench]) -> None:
+    """The first transfer has erased the flash memory: the refusal of the second erase must not end as unchanged."""
+    bench = make()
+    update(bench)
+    step = next(number for number, name in enumerate(bench.faults.steps, 1) if "data at" in name or "segment" in name)
+    bench = make()
+    erase = bench.module.memory.erase
+
+    def erase_once() -> None:
+        erase()
+        bench.module.memory.fault = LoaderFault.REFUSES_ERASE
+
+    bench.module.memory.erase = erase_once  # type: ignore[method-assign]
+    with pytest.raises(Rejected) as caught:
+        update(bench, plan={step: "lost reply"})
+    assert not isinstance(caught.value, EraseRefused)
+    assert bench.module.memory.erased == 1
+
+
+def test_final_status_in_the_bytes_of_the_last_acknowledgement_counts() -> None:
+    bench = UartBench()
+    bench.module.memory.fault = LoaderFault.REFUSES_DATA
+    with pytest.raises(Rejected, match="end of the data: expected status 0, got 10203"):
+        update(bench)
+    assert "boot loader, reset" not in bench.faults.steps
+
+
+def test_final_status_costs_no_wait() -> None:
+    bench = UartBench()
+    update(bench)
+    steps = bench.faults.steps
+    assert steps[-2:] == ["boot loader, data at 768", "boot loader, reset"]
+    assert bench.durations_ns[-2] < 100_000_000
+
+
+@pytest.mark.parametrize(
+    ("make", "code"), [(UartBench, "reset: expected status 0, got 10101"), (CanUpdateBench, "0x08000022")]
+)
+def test_refused_start_is_an_error(make: Any, code: str) -> None:
+    bench = make()
+    bench.module.memory.fault = LoaderFault.REFUSES_START
+    with pytest.raises(Rejected, match=code):
+        update(bench)
 
 
 @pytest.mark.parametrize("make", BENCHES)

@@ -20,6 +20,7 @@ from imud.contracts.firmware import (
     START,
     TRIES,
     WRITE,
+    EraseRefused,
     Firmware,
     FirmwareImage,
     LostContact,
@@ -75,22 +76,39 @@ def update(target: Target, image: FirmwareImage, report: Report) -> RequestScrip
     node: int = target.settings.node
     check_range(image, None)
     total = len(image.data)
-    for left in reversed(range(TRIES)):
+    for attempt in range(TRIES):
         try:
             report(ENTER, 0, total)
             yield from _enter(node)
-            yield from _download(node, image.data, report)
+            yield from _download(node, image.data, report, is_first=not attempt)
             break
         except LostContact:
             payload = pack_frame(SDO_REQUEST + node, False, abort_frame(PROGRAM, IMAGE, TIMED_OUT))
             yield Request(payload, f"node {node}, abort the download", never, never, never, silent=True)
-            if not left:
+            if attempt == TRIES - 1:
                 raise
             yield pause(QUIET_NS)
     report(START, total, total)
-    for _ in range(TRIES):  # the reply can be lost while the device restarts: the version shows the result
-        if not isinstance((yield _write(node, START_APPLICATION, WRITTEN, "start the application")), Silence):
-            break
+    yield from _start_application(node)
+
+
+def _start_application(node: int) -> RequestScript[None]:
+    """Start the application. Raises Aborted.
+
+    The reply can be lost while the device restarts: the version shows the result. An application that already runs
+    lacks the object.
+    """
+    request = _write(node, START_APPLICATION, WRITTEN, "start the application")
+    for _ in range(TRIES):
+        outcome = yield request
+        if isinstance(outcome, Rejection) and _abort_code(outcome) not in ABSENT:
+            raise Aborted(request.name, _abort_code(outcome))
+        if not isinstance(outcome, Silence):
+            return
+
+
+def _abort_code(outcome: Rejection) -> int:
+    return int.from_bytes(outcome.frames[-1].payload[4:], "little")
 
 
 def _enter(node: int) -> RequestScript[None]:
@@ -105,14 +123,15 @@ def _enter(node: int) -> RequestScript[None]:
             return
         yield pause(BOOT_NS)
     if refusal is not None:
-        raise Aborted(enter.name, int.from_bytes(refusal.frames[-1].payload[4:], "little"))
+        raise Aborted(enter.name, _abort_code(refusal))
     raise LostContact(
         f"{enter.name}: expected a confirmation, got none after {ENTER_TRIES} requests; check the node number, the bit "
         "rate and the termination of the bus"
     )
 
 
-def _download(node: int, data: bytes, report: Report) -> RequestScript[None]:
+def _download(node: int, data: bytes, report: Report, *, is_first: bool) -> RequestScript[None]:
+    """Write the image. `is_first`: no earlier transfer of this update can have erased the flash memory."""
     total = len(data)
     report(ERASE, 0, total)
     begin = bytes([BEGIN_DOWNLOAD]) + write_frame(PROGRAM, IMAGE, total.to_bytes(4, "little"))[1:]
@@ -124,10 +143,14 @@ def _download(node: int, data: bytes, report: Report) -> RequestScript[None]:
     if isinstance(outcome, Silence):
         raise LostContact(f"{name}: expected a reply within {ERASE_NS // NS_PER_S} s, got none")
     if isinstance(outcome, Rejection):
-        code = int.from_bytes(outcome.frames[-1].payload[4:], "little")
+        code = _abort_code(outcome)
         if code in ABSENT:
             raise LostContact(f"{name}: expected the boot loader, got the application: the device has restarted")
-        raise Aborted(name, code)
+        refusal = Aborted(name, code)
+        if not is_first:
+            raise refusal
+        yield _write(node, START_APPLICATION, WRITTEN, "start the application")
+        raise EraseRefused(str(refusal))
     for number, at in enumerate(range(0, total, SEGMENT_BYTES)):
         report(WRITE, at, total)
         part = data[at : at + SEGMENT_BYTES]
@@ -154,7 +177,7 @@ def _segment(node: int, at: int, part: bytes, *, toggle: int, last: bool) -> Req
     if isinstance(outcome, Silence):
         raise LostContact(f"{name}: expected a reply within {SEGMENT_NS // NS_PER_S} s, got none")
     if isinstance(outcome, Rejection):
-        code = int.from_bytes(outcome.frames[-1].payload[4:], "little")
+        code = _abort_code(outcome)
         raise LostContact(f"{name}: the boot loader aborted the download: {abort_text(code)} (0x{code:08X})")
 
 

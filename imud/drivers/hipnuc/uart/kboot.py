@@ -16,6 +16,7 @@ device. Then the boot loader waits for a ping for a short time and starts the ap
 import struct
 from binascii import crc_hqx as crc16_xmodem
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 from imud.contracts.codec import BadFrame, BadReason, CodecEvent
@@ -27,6 +28,7 @@ from imud.contracts.firmware import (
     START,
     TRIES,
     WRITE,
+    EraseRefused,
     Firmware,
     FirmwareImage,
     LostContact,
@@ -34,6 +36,7 @@ from imud.contracts.firmware import (
     check_range,
 )
 from imud.contracts.script import Message, Reply, ReplyFrame, Request, RequestScript, Silence, never, pause
+from imud.drivers.hipnuc.uart import commands
 from imud.model.errors import BadArgument, Rejected
 from imud.model.ledger import Ledger
 from imud.model.units import NS_PER_MS, NS_PER_S, uart_byte_ns
@@ -51,6 +54,7 @@ RESTART: Final = b"AT+RST\r\n"
 
 PING_NS: Final = 50 * NS_PER_MS  # wait for the reply to a ping
 COMMAND_NS: Final = 5 * NS_PER_S  # wait for the reply to a command or a data packet, as the vendor's tool
+FINAL_NS: Final = NS_PER_S  # wait for the final status after the acknowledgement of the last data packet
 ERASE_NS: Final = 30 * NS_PER_S  # wait for the end of an erase: 1 MiB in sectors of 2 KiB takes about 20 s
 RESEND_MAX: Final = 5  # maximum number of times that imud sends one packet
 QUIET_NS: Final = 300 * NS_PER_MS  # pause after which the boot loader has discarded an incomplete packet
@@ -216,6 +220,11 @@ def _done(name: str, tag: int, *values: int, timeout_ns: int = COMMAND_NS) -> Re
     _require_success(name, status)
 
 
+def _status_of(reply: Reply) -> int:
+    status: int = struct.unpack_from("<I", reply.frames[-1].payload, 4)[0]
+    return status
+
+
 def _require_success(name: str, status: int) -> None:
     if status:
         raise Rejected(f"boot loader, {name}: expected status 0, got {status}")
@@ -232,19 +241,26 @@ def _property(name: str, number: int) -> RequestScript[int]:
 
 def update(target: Target, image: FirmwareImage, report: Report) -> RequestScript[None]:
     """Write an image and start it. Raises BadArgument, Rejected, LostContact."""
-    for left in reversed(range(TRIES)):
+    for attempt in range(TRIES):
         try:
             yield from _enter(report)
-            yield from _write(target, image, report)
+            yield from _write(target, image, report, is_first=not attempt)
             break
         except LostContact:
-            if not left:
+            if attempt == TRIES - 1:
                 raise
             yield pause(QUIET_NS)
     report(START, len(image.data), len(image.data))
-    for _ in range(TRIES):  # the reply can be lost while the device restarts: the version shows the result
-        if isinstance((yield _command("reset", TAG_RESET, timeout_ns=NS_PER_S)), Reply):
-            break
+    yield from _start_application()
+
+
+def _start_application() -> RequestScript[None]:
+    """Reset the device. Raises Rejected. The reply can be lost while the device restarts: the version shows it."""
+    for _ in range(TRIES):
+        outcome = yield _command("reset", TAG_RESET, timeout_ns=NS_PER_S)
+        if isinstance(outcome, Reply):
+            _require_success("reset", _status_of(outcome))
+            return
 
 
 def _enter(report: Report) -> RequestScript[None]:
@@ -260,7 +276,8 @@ def _enter(report: Report) -> RequestScript[None]:
     )
 
 
-def _write(target: Target, image: FirmwareImage, report: Report) -> RequestScript[None]:
+def _write(target: Target, image: FirmwareImage, report: Report, *, is_first: bool) -> RequestScript[None]:
+    """Erase the flash memory and write the image. `is_first`: no earlier transfer of this update can have erased it."""
     packet_bytes = yield from _property("maximum packet", PROPERTY_PACKET_BYTES)
     flash_bytes = yield from _property("flash size", PROPERTY_FLASH_BYTES)
     sector_bytes = yield from _property("sector size", PROPERTY_SECTOR_BYTES)
@@ -278,34 +295,53 @@ def _write(target: Target, image: FirmwareImage, report: Report) -> RequestScrip
         raise
     total = len(image.data)
     report(ERASE, 0, total)
-    yield from _done("erase", TAG_ERASE, image.address, total, timeout_ns=ERASE_NS)
+    try:
+        yield from _done("erase", TAG_ERASE, image.address, total, timeout_ns=ERASE_NS)
+    except Rejected as error:
+        if not is_first:
+            raise
+        yield _command("reset", TAG_RESET, timeout_ns=NS_PER_S)
+        raise EraseRefused(str(error)) from None
     yield from _done("write", TAG_WRITE, image.address, total)
+
     for at in range(0, total, packet_bytes):
         report(WRITE, at, total)
-        yield from _data(target, at, image.data[at : at + packet_bytes])
+        yield from _data(target, at, image.data[at : at + packet_bytes], is_last=at + packet_bytes >= total)
     report(WRITE, total, total)
-    outcome = yield Request(b"", "boot loader, end of the data", _replies_to(TAG_WRITE), never, never, NS_PER_S)
-    if isinstance(outcome, Reply):  # not every boot loader sends it
-        _require_success("end of the data", struct.unpack_from("<I", outcome.frames[-1].payload, 4)[0])
 
 
-def _data(target: Target, at: int, data: bytes) -> RequestScript[None]:
-    """Send a data packet, again after each NAK. Raises LostContact without an acknowledgement: the boot loader counts
-    the bytes, so imud cannot know whether it must send the packet again."""
+def _data(target: Target, at: int, data: bytes, *, is_last: bool) -> RequestScript[None]:
+    """Send a data packet, again after each NAK. After the last packet, the final status follows the acknowledgement,
+    often in the same bytes.
+
+    Raises LostContact without an acknowledgement: the boot loader counts the bytes, so imud cannot know whether it must
+    send the packet again. Raises Rejected for a status other than 0.
+    """
     wire_ns = (len(data) + HEADER.size) * uart_byte_ns(target.baud) if target.baud else 0
-    request = Request(
-        packet(DATA, data), f"boot loader, data at {at}", _of(ACK), _of(NAK, ABORT), never, COMMAND_NS + wire_ns,
-        repeatable=True,
-    )  # fmt: skip
+    name = f"boot loader, data at {at}"
+    is_status = _replies_to(TAG_WRITE)
+    is_acknowledgement = _of(ACK)
+
+    def ends(message: Message) -> bool:
+        return is_status(message) or (not is_last and is_acknowledgement(message))
+
+    timeout_ns = (FINAL_NS if is_last else COMMAND_NS) + wire_ns
+    request = Request(packet(DATA, data), name, ends, _of(NAK, ABORT), is_acknowledgement, timeout_ns, repeatable=True)
     for _ in range(RESEND_MAX):
         outcome = yield request
-        if isinstance(outcome, Reply):
-            return
+        if isinstance(outcome, Silence) and is_last and not outcome.frames:
+            outcome = yield replace(request, payload=b"", timeout_ns=COMMAND_NS)
         if isinstance(outcome, Silence):
-            raise LostContact(f"{request.name}: expected an acknowledgement, got none")
+            if is_last and outcome.frames:  # not every boot loader sends the final status
+                return
+            raise LostContact(f"{name}: expected an acknowledgement, got none")
+        if isinstance(outcome, Reply):
+            if is_status(outcome.frames[-1]):
+                _require_success("end of the data", _status_of(outcome))
+            return
         if outcome.frames[-1].frame_id == ABORT:
-            raise LostContact(f"{request.name}: the boot loader aborted the transfer")
-    raise LostContact(f"{request.name}: the boot loader received it damaged {RESEND_MAX} times; check the cable")
+            raise LostContact(f"{name}: the boot loader aborted the transfer")
+    raise LostContact(f"{name}: the boot loader received it damaged {RESEND_MAX} times; check the cable")
 
 
 def _flash_start() -> RequestScript[int | None]:
@@ -322,4 +358,10 @@ def _ping(_options: Any) -> Request:
     return ping()
 
 
-FIRMWARE: Final = Firmware(update, _ping, KbootCodec)
+def _find(target: Target) -> RequestScript[str]:
+    """Search for the application, whose baud rate an update can change."""
+    _, baud = yield from commands.find_after_boot((target.baud,))
+    return commands.advice(baud, target.fixed_baud)
+
+
+FIRMWARE: Final = Firmware(update, _ping, KbootCodec, _find)
