@@ -26,6 +26,7 @@ from imud import __version__
 from imud import config as configuration
 from imud.config.model import Config, DeviceConfig
 from imud.contracts.condition import summary
+from imud.contracts.firmware import TOTAL_S
 from imud.contracts.lines import LineFactory
 from imud.contracts.publisher import (
     DeviceControl,
@@ -38,6 +39,7 @@ from imud.contracts.publisher import (
 from imud.contracts.status import DeviceState, DeviceStatus
 from imud.device.device import Device
 from imud.device.factory import DeviceFactory
+from imud.device.firmware import STOP_LIMIT_S
 from imud.device.latency import LatencyBudget
 from imud.device.recordable import RecordableDevices
 from imud.host.clock import HostClock
@@ -309,6 +311,8 @@ class Daemon:
         logging.getLogger().setLevel(new.log_level.upper())
         _log_ignored(new)
         for name in (*change.devices_removed, *change.devices_changed):
+            if name in self._devices:
+                await self._devices[name].firmware.wait_for_end(TOTAL_S)
             self._stop_device(name)
             await asyncio.sleep(0)
         problems = ["a new state_dir needs a restart of imud"] if "state_dir" in change.keys_changed else []
@@ -474,8 +478,29 @@ class Daemon:
         self.on_alarm()
         try:
             await self._stop.wait()
+            await self._wait_for_updates()
         finally:
             self._alarm.cancel()
+
+    async def _wait_for_updates(self) -> None:
+        """Wait for the end of running firmware updates: an interrupted update leaves a device in its boot loader."""
+        updates = {name: device.firmware for name, device in self._devices.items()}
+        names = [name for name, update in updates.items() if not update.is_interruptible]
+        if not names:
+            return
+        self._stop.clear()
+        log.warning(
+            "imud stops after the firmware update of %s, at most %g s; a second stop interrupts the update",
+            ", ".join(names), STOP_LIMIT_S,
+        )  # fmt: skip
+        second_stop = asyncio.create_task(self._stop.wait())
+        ends = asyncio.gather(*(updates[name].wait_for_end(STOP_LIMIT_S) for name in names))
+        await asyncio.wait({second_stop, ends}, return_when=asyncio.FIRST_COMPLETED)
+        second_stop.cancel()
+        ends.cancel()
+        for name in names:
+            if not updates[name].is_interruptible:
+                log.error("%s: imud stops during the firmware update; start imud and repeat the update", name)
 
     def tick_soon(self) -> None:
         """Tick within TICK_S. A part that needs ten ticks per second calls this method in each tick."""

@@ -157,6 +157,7 @@ LONG_MODULES = {
 }
 LONG_CLASSES = {
     "DeviceSettings": "one state machine: what imud knows of the settings of a device",
+    "HipnucModule": "one simulated device with its commands and faults",
     "SampleClock": "one state machine with a fast path",
 }
 LARGE_CONSTRUCTORS = {
@@ -549,6 +550,7 @@ TESTED_IN = {
     "imud.config.parts": "config/test_reading_signals.py",
     "imud.config.schema": "config/test_reading.py", "imud.device.device": "device/test_can_transport.py",
     "imud.device.factory": "device/test_search.py", "imud.device.transport": "device/test_stream_transport.py",
+    "imud.device.pending_updates": "device/test_firmware_faults.py", "imud.device.turns": "device/test_calibration.py",
     "imud.drivers.hipnuc.bus_load": "drivers/hipnuc/test_common.py",
     "imud.drivers.hipnuc.canopen.cia301": "drivers/hipnuc/canopen/test_commands.py",
     "imud.drivers.hipnuc.canopen.firmware": "drivers/hipnuc/test_firmware_update.py",

@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from time import monotonic_ns, sleep, time_ns
 from typing import Any, cast
-from unittest.mock import AsyncMock, Mock
+from unittest.mock import AsyncMock, Mock, PropertyMock
 
 import msgspec
 import pytest
@@ -250,6 +250,38 @@ async def test_a_reload_that_fails_ends_the_daemon_and_other_ends_do_not(caplog:
         with pytest.raises(ServerError if error else RuntimeError, match=r"^it failed$"):
             await running
     assert [one.getMessage() for one in caplog.records if one.levelname == "ERROR"][-2:].count("it failed") == 1
+
+
+@pytest.mark.parametrize("end", ["update", "second stop"])
+@in_loop
+async def test_stop_waits_for_a_firmware_update(
+    end: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon = Daemon(EMPTY)
+    update_end = asyncio.Event()
+    update = Mock(wait_for_end=lambda _limit_s: update_end.wait())
+    type(update).is_interruptible = PropertyMock(side_effect=update_end.is_set)
+    monkeypatch.setitem(daemon._devices, "bow", cast(Device, Mock(firmware=update)))
+
+    daemon.stop()
+    waiting = asyncio.create_task(daemon._wait_for_updates())
+    for _ in range(5):
+        await asyncio.sleep(0)
+    assert not waiting.done()
+    if end == "update":
+        update_end.set()
+    else:
+        daemon.stop()
+    await waiting
+    assert ("start imud and repeat the update" in caplog.text) == (end == "second stop")
+
+
+@in_loop
+async def test_stop_without_an_update_does_not_wait() -> None:
+    daemon = Daemon(EMPTY)
+    daemon.stop()
+    await daemon._wait_for_updates()
+    assert daemon._stop.is_set()
 
 
 def config_of(folder: Path, **devices: dict[str, Any]) -> Config:

@@ -87,6 +87,7 @@ class Known(msgspec.Struct):
     utc_problem: str = ""
     open_bytes: int = 0  # bytes and frames that the ledger does not account for
     open_frames: int = 0
+    is_in_boot_loader: bool = False  # whether the problem is an incomplete firmware update
 
 
 class Facts(Known, kw_only=True):
@@ -174,7 +175,7 @@ def _stopped(facts: Facts, _name: str, _value: Any) -> str:
 
 
 def _gets_no_data(facts: Facts, _limits: ConditionLimits) -> bool:
-    if facts.state is DeviceState.MISSING:  # the port is not checked yet
+    if facts.state is DeviceState.MISSING or facts.is_in_boot_loader:  # the port is not checked yet, or a clear cause
         return False
     has_reply = facts.is_polled or facts.problem.startswith(("it replies", SEARCH_BEGUN))
     return not facts.recent.bytes_in and not has_reply
@@ -412,7 +413,8 @@ class ConditionWatch:
         """Return the causes that count now: they lasted long enough, or ended a short time ago."""
         if causes[0].rule.code in MISSING:  # then there is no other cause
             self._missing_ns = now_ns if self._missing_ns is None else self._missing_ns
-            if self._found and now_ns - self._missing_ns < self._begin_ns:
+            is_short = now_ns - self._missing_ns < self._begin_ns
+            if self._found and is_short and not causes[0].facts.is_in_boot_loader:
                 return self._counted
             self._causes.clear()
             return causes

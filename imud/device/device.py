@@ -34,7 +34,7 @@ from imud.device.calibration import CalibrationRun
 from imud.device.condition import ConditionJudge, Known
 from imud.device.firmware import FirmwareUpdate
 from imud.device.flash import SettingsFiles
-from imud.device.health import NO_SAMPLE, RUNNING, DeviceEvents, Health
+from imud.device.health import NO_SAMPLE, RUNNING, STREAMING, DeviceEvents, Health
 from imud.device.latency import Need
 from imud.device.settings import DeviceSettings, identity_words
 from imud.device.settings_plan import setting_instead
@@ -107,7 +107,7 @@ class Device:
         self._attachments.add(self.settings)
         self._attachments.add(transport.samples)
         self._verb_run = VerbRun(self.settings, transport)
-        self.firmware = FirmwareUpdate(config.name, transport, self.settings, self._events, self._health, host)
+        self.firmware = FirmwareUpdate(context, transport, self.settings, shared.files.updates)
         self._attitude = AttitudeWatch(config, self._events)
         self._status = StatusWatch(self._events, config.attitude)
         self._judge = ConditionJudge(config, transport.link.title, self.ledger, self._events, host.now_ns())
@@ -202,6 +202,7 @@ class Device:
             health.state, health.problem, settings.resets - settings.resets_requested, transport.is_polled,
             settings.status() if has_settings else None, axes, axes_problem, lines,
             path is not None and path.clock.has_scattered_time, utc_problem, ledger.bytes_open(), ledger.frames_open(),
+            transport.is_in_boot_loader,
         ), newest.t_ns if newest is not None else 0)  # fmt: skip
 
     def _tick_flow(self, path: SamplePath, now_ns: int) -> None:
@@ -411,6 +412,10 @@ class Device:
 
     def _watch_flow(self, path: SamplePath, now_ns: int) -> None:
         state, quiet_ns = self._health.state, now_ns - max(path.last_sample_ns, path.begun_ns)
+        if state in STREAMING and (problem := self._transport.loader_words(path)):
+            if state is DeviceState.RUNNING or problem != self._health.problem:
+                self._health.down(now_ns, DeviceState.SILENT, problem)
+            return
         if (state is DeviceState.SEARCHING and path.fresh) or (
             state is DeviceState.SILENT and now_ns - path.last_sample_ns < SILENCE_NS
         ):
@@ -427,6 +432,7 @@ class Device:
     def _up(self, now_ns: int) -> None:
         transport = self._transport
         self._attachments.device_found()
+        self.firmware.on_samples()
         driver = transport.driver.name if transport.driver is not None else ""
         self._health.up(now_ns, driver, transport.where, transport.bit_rate)
 

@@ -17,6 +17,7 @@ import msgspec
 from imud.config.yaml import yaml_block, yaml_comment
 from imud.contracts.command import CalibrationResult, LastCalibration
 from imud.contracts.setting import SavedState
+from imud.device.pending_updates import PendingUpdates
 from imud.host.clock import HostClock
 from imud.host.files import StateFile, replace_file
 from imud.model.errors import CommandError
@@ -212,9 +213,11 @@ class SettingsFiles:
     def __init__(self, state_dir: Path | None, host: HostClock) -> None:
         self.flash = FlashWrites(state_dir, host)
         self.backups = BackupFolder(state_dir)
+        self.updates = PendingUpdates(state_dir, host)
 
     def close(self) -> None:
         self.flash.close()
+        self.updates.close()
 
 
 def _time(utc_ns: int) -> datetime:

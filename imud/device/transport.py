@@ -203,6 +203,11 @@ class Transport(SettingsPort):
         since_ns, words = self._loader
         return words if path.last_sample_ns <= since_ns else ""
 
+    @property
+    def is_in_boot_loader(self) -> bool:
+        """Whether the device is in its boot loader after a firmware update, as far as imud knows."""
+        return bool(self._loader[1] if self.path is None else self.loader_words(self.path))
+
     # --- the samples -------------------------------------------------------------------------------------------------
 
     @abstractmethod

@@ -6,6 +6,7 @@ The bytes and edges of the HiPNUC device arrive in step.
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import pytest
@@ -232,10 +233,11 @@ class LinkedDevice:
         driver, identify = config.pop("driver", "hipnuc-uart"), config.pop("identify", True)
         lines: DeviceLines | None = config.pop("lines", None)
         declared = config.pop("declared", None)
+        state_dir: Path | None = config.pop("state_dir", None)
         memory = MemoryOptions(**{"baud": 115200, **config})
         self.module = HipnucModule(clock.now_ns(), settings, hardware)
         self.link = LinkedModule(memory, self.module, clock)
-        self.rigs = DeviceRigs(clock.host)
+        self.rigs = DeviceRigs(clock.host, state_dir=state_dir)
         self.rig = self.rigs.add(
             DeviceConfig("bow", driver, None, identify, "memory", memory, lines=lines, declared=declared), self.link
         )
