@@ -20,7 +20,7 @@ from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from time import thread_time_ns
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from imud import __version__
 from imud import config as configuration
@@ -493,8 +493,9 @@ class Daemon:
             "imud stops after the firmware update of %s, at most %g s; a second stop interrupts the update",
             ", ".join(names), STOP_LIMIT_S,
         )  # fmt: skip
-        second_stop = asyncio.create_task(self._stop.wait())
-        ends = asyncio.gather(*(updates[name].wait_for_end(STOP_LIMIT_S) for name in names))
+        second_stop: asyncio.Future[Any] = asyncio.ensure_future(self._stop.wait())
+        waits = [updates[name].wait_for_end(STOP_LIMIT_S) for name in names]
+        ends: asyncio.Future[Any] = asyncio.gather(*waits)
         await asyncio.wait({second_stop, ends}, return_when=asyncio.FIRST_COMPLETED)
         second_stop.cancel()
         ends.cancel()

@@ -272,13 +272,13 @@ class CalibrationRun:
         self.is_sent = True
         await self._transport.run_script(calibration.begin)
         turning = Turning(is_planar=calibration.handling is Handling.SPIN)
-        begun_ns = report_ns = ask_ns = self._now_ns
+        start_ns = report_ns = ask_ns = self._now_ns
         lost_replies = 0
         # The end of an earlier calibration is not evidence: after it, the device must report a running calibration.
         has_run = not (calibration.reports_start and (before.done or before.has_failed))
         problem = "the device did not finish the calibration"
 
-        while self._now_ns - begun_ns < TURN_LIMIT_NS:
+        while self._now_ns - start_ns < TURN_LIMIT_NS:
             now_ns, sample = await self._next()
             if sample is not None:
                 turning.add(sample)
@@ -300,13 +300,13 @@ class CalibrationRun:
                     turning.restart_field()
                 has_run = has_run or not (verdict.done or verdict.has_failed)
             if not has_run:
-                if _is_unstarted(now_ns - begun_ns, turning):
-                    return verdict.words, _field_checks(turning, verdict), _unstarted(turning, verdict)
+                if _is_unstarted(now_ns - start_ns, turning):
+                    return verdict.words, _field_checks(turning, verdict), _describe_missing_start(turning, verdict)
                 continue
             if verdict.has_failed:
                 advice = _advice(turning, _field_checks(turning, verdict))
-                words = f"the device reports that the calibration failed: {verdict.words}; {advice}"
-                return verdict.words, _field_checks(turning, verdict), words
+                text = f"the device reports that the calibration failed: {verdict.words}; {advice}"
+                return verdict.words, _field_checks(turning, verdict), text
             is_new = calibration.reports_start or verdict.words != before.words or before.done
             if verdict.done and turning.share >= 1.0 and is_new:
                 problem = _offset_problem(turning, verdict)
@@ -432,10 +432,10 @@ def _offset_problem(turning: Turning, verdict: Verdict) -> str:
     offset_t = turning.offset(verdict.bias_t)
     if offset_t is None or hypot(*offset_t) <= OFFSET_MAX_T:
         return ""
-    shown = ", ".join(f"{value / T_PER_UT:.1f}" for value in offset_t)
+    offset_text = ", ".join(f"{value / T_PER_UT:.1f}" for value in offset_t)
     return (
         f"the bias of the device does not fit the measured field: expected an offset of at most "
-        f"{OFFSET_MAX_T / T_PER_UT:g} µT, got {shown} µT; repeat the calibration"
+        f"{OFFSET_MAX_T / T_PER_UT:g} µT, got {offset_text} µT; repeat the calibration"
     )
 
 
@@ -444,7 +444,7 @@ def _is_unstarted(duration_ns: int, turning: Turning) -> bool:
     return duration_ns >= UNSTARTED_LIMIT_NS or (duration_ns >= START_LIMIT_NS and turning.share >= 1.0)
 
 
-def _unstarted(turning: Turning, verdict: Verdict) -> str:
+def _describe_missing_start(turning: Turning, verdict: Verdict) -> str:
     """Return that the device did not start the calibration, and the measured offset."""
     offset = _offset_problem(turning, verdict) if turning.share >= 1.0 else ""
     return (

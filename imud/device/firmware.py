@@ -194,14 +194,14 @@ class FirmwareUpdate:
 
     async def _verify(self, before: str, expected: str) -> tuple[str, bool, str]:
         """Return the version of the device, whether it is the expected version, and the evidence."""
-        after = await self._read_version()
-        if after:
-            return after, *_compared(before, after, expected)
+        version = await self._read_version()
+        if version:
+            return version, *_compared(before, version, expected)
 
-        after, advice = await self._find_application()
-        if after:
-            verified, evidence = _compared(before, after, expected)
-            return after, verified, f"{evidence}; {advice}" if advice else evidence
+        version, advice = await self._find_application()
+        if version:
+            verified, evidence = _compared(before, version, expected)
+            return version, verified, f"{evidence}; {advice}" if advice else evidence
         seconds = VERIFY_NS // NS_PER_S
         return (
             "",

@@ -68,7 +68,8 @@ class Turning:
         for axis, rate in enumerate(sample.gyro_rad_s):
             self._turned[axis] += abs(rate) * step_s
         sign = -1.0 if _dot(self._axis, sample.gyro_rad_s) < 0.0 else 1.0
-        x, y, z = (mean + sign * rate * step_s for mean, rate in zip(self._axis, sample.gyro_rad_s, strict=True))
+        angles = (sign * rate * step_s for rate in sample.gyro_rad_s)
+        x, y, z = (mean + angle for mean, angle in zip(self._axis, angles, strict=True))
         self._axis = (x, y, z)
 
     def _add_field(self, field_t: Vector3) -> None:
@@ -95,7 +96,7 @@ class Turning:
         With `is_planar`, the turns since the last `restart_field` count: a circle has few directions and no sphere.
         """
         if self.is_planar:
-            angles = (angle - before for angle, before in zip(self._turned, self._turned_before, strict=True))
+            angles = (angle - start for angle, start in zip(self._turned, self._turned_before, strict=True))
             return min(1.0, max(angles) / TURNS_WANTED_RAD)
         return min(1.0, coverage(self.cells(self.fit())) / COVERAGE_WANTED, min(self._turned) / TURNS_WANTED_RAD)
 
@@ -180,7 +181,8 @@ class _SphereFit:
         u, v = _plane_of(axis)
         # the equations of the sphere for a centre in the plane of u and v
         rows = ((*u, 0.0, 0.0), (*v, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 0.0, 1.0))
-        columns = list(zip(*([_dot(sums, row) for row in rows] for sums in self._sums), strict=True))
+        products = [[_dot(sums, row) for row in rows] for sums in self._sums]
+        columns = list(zip(*products, strict=True))
         matrix = [[_dot(column, row) for column in columns] for row in rows[:3]]
         solved = _solve(matrix)
         if solved is None:
@@ -190,8 +192,8 @@ class _SphereFit:
         return (x, y, z)
 
 
-def _dot(one: Sequence[float], other: Sequence[float]) -> float:
-    return sum(left * right for left, right in zip(one, other, strict=True))
+def _dot(left: Sequence[float], right: Sequence[float]) -> float:
+    return sum(a * b for a, b in zip(left, right, strict=True))
 
 
 def _unit(vector: Vector3) -> Vector3:

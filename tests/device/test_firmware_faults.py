@@ -22,7 +22,9 @@ LOADER = "boot loader"
 
 
 def reasons(device: LinkedDevice) -> list[tuple[ReasonCode, str]]:
-    return [(reason.code, reason.message) for reason in device.device.status().condition.reasons]
+    condition = device.device.status().condition
+    assert condition is not None
+    return [(reason.code, reason.message) for reason in condition.reasons]
 
 
 @played(LinkedDevice)
@@ -127,7 +129,7 @@ def stored(folder: Path) -> dict[str, int]:
     return msgspec.json.decode(file.read_bytes(), type=dict[str, int]) if file.exists() else {}
 
 
-def test_interrupted_update_is_named_after_a_restart_of_imud(tmp_path: Path) -> None:
+def test_restart_of_imud_names_interrupted_update(tmp_path: Path) -> None:
     first = LinkedDevice(state_dir=tmp_path)
 
     async def interrupt() -> None:

@@ -296,7 +296,7 @@ def test_refused_erase_starts_the_application_again(make: Any, code: str) -> Non
 
 
 @pytest.mark.parametrize("make", BENCHES)
-def test_erase_refused_after_a_lost_transfer_is_not_unchanged(make: Callable[[], Bench]) -> None:
+def test_erase_refused_after_lost_transfer(make: Callable[[], Bench]) -> None:
     """The first transfer has erased the flash memory: the refusal of the second erase must not end as unchanged."""
     bench = make()
     update(bench)
@@ -315,7 +315,7 @@ def test_erase_refused_after_a_lost_transfer_is_not_unchanged(make: Callable[[],
     assert bench.module.memory.erased == 1
 
 
-def test_final_status_in_the_bytes_of_the_last_acknowledgement_counts() -> None:
+def test_final_status_next_to_last_acknowledgement() -> None:
     bench = UartBench()
     bench.module.memory.fault = LoaderFault.REFUSES_DATA
     with pytest.raises(Rejected, match="end of the data: expected status 0, got 10203"):

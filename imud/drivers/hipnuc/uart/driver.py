@@ -243,7 +243,8 @@ def _started_verdict(target: Target) -> RequestScript[Verdict]:
     """
     state = yield from firmware.calibration_state()
     bias = yield from _magnetometer_verdict(target)
-    return replace(state, words=", ".join(filter(None, (bias.words, state.words))), bias_t=bias.bias_t)
+    words = ", ".join(filter(None, (bias.words, state.words)))
+    return replace(state, words=words, bias_t=bias.bias_t)
 
 
 def _calibration_unknown(_target: Target) -> RequestScript[str]:

@@ -110,7 +110,8 @@ def read_calibration(lines: Sequence[str]) -> Verdict:
         else:
             states.append(f"{name} {text}".strip())
     state = ", ".join(states)
-    has_failed = any(_FAILED.search(text) and text.split()[-1].upper() not in _NO_FAULT for text in states)
+    faults = [text for text in states if text.split()[-1].upper() not in _NO_FAULT]
+    has_failed = any(_FAILED.search(text) for text in faults)
     is_end = _DONE.search(state) is not None or (not states and progress == 1.0)
     done = is_end and not has_failed and _NOT.search(state) is None
     return Verdict(done, state, progress, has_failed)

@@ -306,7 +306,8 @@ def _write(target: Target, image: FirmwareImage, report: Report, *, is_first: bo
 
     for at in range(0, total, packet_bytes):
         report(WRITE, at, total)
-        yield from _data(target, at, image.data[at : at + packet_bytes], is_last=at + packet_bytes >= total)
+        is_last = at + packet_bytes >= total
+        yield from _data(target, at, image.data[at : at + packet_bytes], is_last=is_last)
     report(WRITE, total, total)
 
 
