@@ -261,27 +261,24 @@ async def test_stop_waits_for_a_firmware_update(
     update_end = asyncio.Event()
     update = Mock(wait_for_end=lambda _limit_s: update_end.wait())
     type(update).is_interruptible = PropertyMock(side_effect=update_end.is_set)
-    monkeypatch.setitem(daemon._devices, "bow", cast(Device, Mock(firmware=update)))
+    device = Mock(firmware=update)
+    running = asyncio.create_task(daemon.run())
+    await asyncio.sleep(0)
+    monkeypatch.setitem(daemon._devices, "bow", device)
 
     daemon.stop()
-    waiting = asyncio.create_task(daemon._wait_for_updates())
-    for _ in range(5):
+    for _ in range(9):
         await asyncio.sleep(0)
-    assert not waiting.done()
+    assert not running.done()
+    device.close.assert_not_called()
     if end == "update":
         update_end.set()
     else:
         daemon.stop()
-    await waiting
+    await running
+    device.close.assert_called_once()
+    assert "imud stops after the firmware update of bow, at most 80 s" in caplog.text
     assert ("start imud and repeat the update" in caplog.text) == (end == "second stop")
-
-
-@in_loop
-async def test_stop_without_an_update_does_not_wait() -> None:
-    daemon = Daemon(EMPTY)
-    daemon.stop()
-    await daemon._wait_for_updates()
-    assert daemon._stop.is_set()
 
 
 def config_of(folder: Path, **devices: dict[str, Any]) -> Config:
