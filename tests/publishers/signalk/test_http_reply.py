@@ -2,7 +2,7 @@
 
 import pytest
 
-from imud.publishers.signalk.http_reply import InvalidReply, ReplyParser
+from imud.publishers.signalk.http_reply import HEAD_BYTES_MAX, InvalidReply, ReplyParser
 
 LIMIT = 65_536
 
@@ -85,16 +85,26 @@ def test_invalid_replies(data: bytes, problem: str) -> None:
 @pytest.mark.parametrize(
     "data",
     [
-        HEAD + b"A: b\r\n" * 20_000,
         INTERIM * 5_000,
         HEAD + b"\r\n" + bytes(100_000),
         CHUNKED + b"1\r\nx\r\n" * 20_000,
         CHUNKED + b"FFFFFFFF\r\n" + bytes(100_000),
         CHUNKED + b"0\r\n" + b"A: b\r\n" * 20_000,
     ],
-    ids=["headers", "interim replies", "body", "chunks", "one chunk", "trailers"],
+    ids=["interim replies", "body", "chunks", "one chunk", "trailers"],
 )
 def test_an_endless_reply_ends_at_the_limit(data: bytes) -> None:
     with pytest.raises(InvalidReply, match="expected at most 65536 bytes, got more"):
         parse(data[: LIMIT + 1], 2048)
     assert not parse(data[:LIMIT], 2048).is_complete
+
+
+def test_length_of_the_headers() -> None:
+    """imud parses all headers in one turn of the event loop."""
+    fill = HEAD_BYTES_MAX - len(HEAD) - len(b"A: ")
+    for piece_bytes in (1, 2048, 1 << 20):
+        reply = parse(HEAD + b"A: " + b"x" * fill + b"\r\n\r\n", piece_bytes, ends=True)
+        assert len(reply.headers["a"]) == fill
+        for data in (HEAD + b"A: " + b"x" * (fill + 1) + b"\r\n\r\n", HEAD + b"A: b\r\n" * 20_000):
+            with pytest.raises(InvalidReply, match="expected headers of at most 8192 bytes, got more"):
+                parse(data, piece_bytes)
