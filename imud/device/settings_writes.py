@@ -17,6 +17,7 @@ from imud.contracts.setting import (
     SettingsPlan,
     SettingsTable,
     StepOutcome,
+    Written,
     combined,
 )
 from imud.device.flash import ModuleFlash
@@ -58,6 +59,7 @@ class Applying:
     changed: bool = False  # whether imud has written a setting
     # Settings whose script has reported that the value needs a restart, although the table does not require it
     pending: set[str] = field(default_factory=set)
+    verified: set[str] = field(default_factory=set)  # settings whose script has verified the value
     heard: bool = True  # whether the device has replied to the newest read
     problem: str = ""
 
@@ -118,6 +120,8 @@ class Applying:
             self.changed = True
             if result in PENDING:
                 self.pending.add(step.name)
+            if result is Written.VERIFIED:
+                self.verified.add(step.name)
             if by_itself:
                 break
         # an error can be the sign of a restart, which loses unsaved values
@@ -170,7 +174,9 @@ class Applying:
             failure = f"the device has not reported its settings after the write: {why_unread}"
         elif not is_read:
             self.written[name] = self.wanted[name]
-            outcome, message = StepOutcome.NOT_VERIFIED, NOT_REPORTED
+            if name not in self.verified:
+                outcome = StepOutcome.NOT_VERIFIED
+                message = NOT_REPORTED
         elif is_pending and not self.restarted:
             outcome = StepOutcome.WRITTEN
         elif not agrees:

@@ -59,9 +59,12 @@ class Readdressing:
         # a device that uses the new place immediately may confirm one write at the present place, but not two
         for place in (self.present, new):
             if (yield from self.write(place, new)):
-                if place != self.present:
-                    yield self.move(place)
-                return (yield from self.verify(place, new))
+                if place == self.present:
+                    return (yield from self.verify(place, new))
+                yield self.move(place)
+                written = yield from self.verify(place, new)
+                # the device replies at a place at which no device replied before: it needs no readable register
+                return Written.VERIFIED if written is Written.UNVERIFIED else written
         # the device may use the new place and not reply: command it back without waiting for a reply
         yield replace(next(self.write(new, self.present)), also=(), silent=True)
         raise NoReply(self.lost.format(confirmed=confirmed, new=new, present=self.present))

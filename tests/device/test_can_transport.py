@@ -502,15 +502,26 @@ class BusInProcess:
         play_rigs(self.rigs, told, self.clock)
 
 
-async def made_so(bus: BusInProcess, wanted: Mapping[str, object], saves: Callable[[], int], *, verified: bool) -> None:
-    """Apply and save settings with a number that is in use, then with number 9. Check the result of each setting."""
+async def made_so(
+    bus: BusInProcess, wanted: Mapping[str, object], saves: Callable[[], int], *, verified: bool, is_number_seen: bool
+) -> None:
+    """Apply and save settings with a number that is in use, then with number 9. Check the result of each setting.
+
+    `is_number_seen`: whether imud can verify the new number. Otherwise a person must save it.
+    """
     number = "node" if "node" in wanted else "address"
     taken = await bus.done(bus.rig.device.settings.apply({number: 12}, save=True))
     assert f"{number} 12 is in use" in taken.problem
     assert saves() == 0
     applied = await bus.done(bus.rig.device.settings.apply(wanted, save=True))
-    assert applied.problem == "", applied
     assert {step.name for step in applied.steps} == set(wanted)
+    if not is_number_seen:
+        assert (applied.saved, applied.restarted, saves()) == (False, False, 0)
+        assert applied.problem.startswith(f"{number}: the device does not report this setting"), applied
+        for command in ("save", "restart"):
+            await bus.done(bus.rig.device.act(command, {}))
+        return
+    assert applied.problem == "", applied
     assert any("not verified" in str(step.outcome) for step in applied.steps) is not verified, applied
     assert applied.saved
     count = len(bus.rig.samples)
@@ -527,7 +538,16 @@ def test_declared_settings_are_applied_to_a_canopen_node(variant: str) -> None:
     beside = HipnucCanopenModule(clock.now_ns(), HipnucCanopenHardware(factory=other, boot_ms=0))
     bus = BusInProcess(clock, "hipnuc-canopen", HipnucCanopenOptions(), module, beside)
     wanted = {"tpdo2_interval_ms": 100, "incli_x_reversed": True, "node": 9}
-    bus.play(lambda: made_so(bus, wanted, lambda: module.objects.writes_to_flash, verified=kind.reads == "answered"))
+    is_seen = kind.reads == "answered" or kind.number_at_once
+    bus.play(
+        lambda: made_so(
+            bus,
+            wanted,
+            lambda: module.objects.writes_to_flash,
+            verified=kind.reads == "answered",
+            is_number_seen=is_seen,
+        )
+    )
     saved = module.objects.saved
     assert (saved.periods_ms[2], saved.invert_x, saved.node, module.node) == (100, 1, 9, 9)
     assert beside.objects.settings == other
@@ -540,7 +560,12 @@ def test_declared_settings_are_applied_to_a_j1939_module(variant: str) -> None:
     beside = HipnucJ1939Module(clock.now_ns(), J1939Settings(address=12), J1939Hardware(boot_ms=0))
     bus = BusInProcess(clock, "hipnuc-j1939", HipnucJ1939Options(), module, beside)
     wanted = {"ff37_interval_ms": 50, "y_reversed": True, "address": 9}
-    bus.play(lambda: made_so(bus, wanted, lambda: module.writes_to_flash, verified=kind.reads != "ignored"))
+    is_seen = kind.reads != "ignored" or kind.address_at_once
+    bus.play(
+        lambda: made_so(
+            bus, wanted, lambda: module.writes_to_flash, verified=kind.reads != "ignored", is_number_seen=is_seen
+        )
+    )
     assert (module.flash.intervals_ms[0xFF37], module.flash.y_reversed, module.flash.address) == (50, 1, 9)
     assert beside.settings == J1939Settings(address=12)
 
