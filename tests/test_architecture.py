@@ -156,6 +156,8 @@ LONG_MODULES = {
     "imud.sampling.path": "the path of the samples, for streams, CAN and polled devices",
 }
 LONG_CLASSES = {
+    "Daemon": "one owner: start, reload, failures, ticks and stop of all parts",
+    "Device": "one state machine: link, samples, commands and status of a device",
     "DeviceSettings": "one state machine: what imud knows of the settings of a device",
     "HipnucModule": "one simulated device with its commands and faults",
     "SampleClock": "one state machine with a fast path",
@@ -463,7 +465,8 @@ source."""
 EXECUTORS = {"eval", "exec", "compile", "__import__"}
 OBJECT_FORMATS = {"pickle", "marshal", "shelve", "dill", "jsonpickle", "multiprocessing"}
 SETTERS = {
-    "imud.fleet.broker": "names of callbacks and properties in the code",
+    "imud.drivers.foreign": "LEDGER_FIELDS",
+    "imud.fleet.paho_client": "names of callbacks and properties in the code",
     "imud.fleet.database.transaction": "fields of a struct",
     "imud.formats.state": "fields of a table",
     "imud.links.serial_port": "names in the code",

@@ -13,7 +13,7 @@ STATUS_LINE: Final = re.compile(rb"HTTP/1\.[01] ([1-9][0-9]{2})(?: [^\r\n]*)?")
 HEADER: Final = re.compile(rb"([!#$%&'*+.^_`|~0-9A-Za-z-]+):[ \t]*([^\r\n]*?)[ \t]*")
 LENGTH: Final = re.compile(rb"[0-9]{1,9}")
 CHUNK_LINE: Final = re.compile(rb"([0-9A-Fa-f]{1,8})[ \t]*(?:;[^\r\n]*)?")
-# Maximum length of the status line and the headers, bytes. imud parses them in one turn: 8 kB of short headers cost 1 ms.
+# Maximum length of the status line and the headers, bytes. imud parses them in one turn: 8 kB of headers cost 1 ms.
 HEAD_BYTES_MAX: Final = 8192
 LINE_BYTES_MAX: Final = 256  # maximum length of the line before a chunk, and of a line after the last chunk, bytes
 HEAD_END: Final = b"\r\n\r\n"
