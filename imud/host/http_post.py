@@ -7,13 +7,15 @@ from typing import Final, NamedTuple
 from urllib.parse import parse_qsl, urlsplit
 
 from imud.host.files import read_regular_file
-from imud.host.http_reply import HttpReply, InvalidReply
+from imud.host.http_reply import HttpReply, IncompleteReply, InvalidReply
 from imud.host.network import tls_context
 from imud.host.timed_connection import TimedConnection
 from imud.model.errors import reason_of
 
 # Maximum time of a request, from the name resolution to the complete reply, s: 1 MB at 0.5 Mbit/s take 16 s
 REQUEST_S: Final = 20.0
+# Maximum length of the content of a reply that imud reads, bytes. The content is only for the message of an error.
+CONTENT_BYTES: Final = 4096
 REASON_CHARACTERS: Final = 200  # maximum length of a server's message in logs and status
 TOKEN_BYTES: Final = 4096  # maximum size of a token file, bytes
 TOO_LARGE: Final = 413  # status code "Content Too Large" (RFC 9110, section 15.5.14)
@@ -107,7 +109,8 @@ class HttpPost:
         self._connection.close()
 
     def _exchange(self, request: bytes) -> HttpReply:
-        connection, reply = self._connection, HttpReply()
+        connection = self._connection
+        reply = HttpReply(CONTENT_BYTES, truncates_content=True)
         connection.start(REQUEST_S)
         # input before a request: the server closed the connection, or sent bytes that imud did not request
         if connection.is_open and connection.has_input():
@@ -171,6 +174,8 @@ class HttpPost:
 
 def _cause(error: Exception) -> str:
     """Return the reason of a failed request."""
+    if isinstance(error, IncompleteReply):
+        return str(error)
     if isinstance(error, InvalidReply):
         return f"invalid HTTP reply: {error}"
     # the number of a TLS error is not the number of a system error

@@ -14,12 +14,12 @@ from imud.contracts.lines import UtcReference
 from imud.contracts.link import StreamLink
 from imud.device.utc import UtcFeed
 from imud.formats.nmea0183 import Rmc, build, parse
+from imud.host.http_reply import SWITCHING_PROTOCOLS, HttpReply, InvalidReply
 from imud.host.peer_stream import PeerStream
 from imud.model.units import NS_PER_MS, NS_PER_S
 from imud.model.work_budget import WorkBudget
 from imud.publishers.signalk import client as signalk_client
-from imud.publishers.signalk.client import REPLY_BYTES_MAX
-from imud.publishers.signalk.http_reply import HEAD_END, SWITCHING_PROTOCOLS, InvalidReply, ReplyParser
+from imud.publishers.signalk.client import CONTENT_BYTES_MAX
 from imud.publishers.signalk.server import DENIED, QUEUE_MAX, SignalKServer
 from imud.publishers.signalk.settings import SignalKOptions
 from imud.publishers.signalk.websocket import CONTROL_BYTES_MAX, InvalidFrame, WebSocketReader, accept_of
@@ -36,6 +36,7 @@ GPSD_BYTES_MAX: Final = 2048
 SIGNALK_BYTES_MAX: Final = 2048
 WAITS_MS: Final = ((0,), (0,), (0, 1, 100), (0, 700, 1000, 4000))  # times between two pieces of a connection
 NEXT: Final = b"\n--next--\n"  # separates the replies to successive connections
+HEAD_END: Final = b"\r\n\r\n"  # separates the headers and the content of a reply
 CPU_PER_READ_NS: Final = 700_000  # virtual CPU time of a piece: some inputs exceed the budget
 GPSD_S: Final = 30  # virtual time of a gpsd session, s
 SESSION_S: Final = 90  # virtual time of a Signal K session, s. imud sends one delta each second.
@@ -212,7 +213,7 @@ def run_http_reply(data: bytes) -> None:
 
 
 def _parse_reply(pieces: Sequence[bytes]) -> tuple[object, ...]:
-    reply = ReplyParser(REPLY_BYTES_MAX)
+    reply = HttpReply(CONTENT_BYTES_MAX)
     rest = bytearray()
     try:
         for piece in pieces:
@@ -225,9 +226,9 @@ def _parse_reply(pieces: Sequence[bytes]) -> tuple[object, ...]:
     except InvalidReply as error:
         check_printable(str(error))
         return (str(error),)
-    assert 101 <= reply.status <= 999
+    assert 101 <= reply.status <= 599
     is_switch = reply.status == SWITCHING_PROTOCOLS
-    return reply.status, reply.headers, bytes(reply.body), reply.rest + bytes(rest) if is_switch else b""
+    return reply.status, reply.headers, bytes(reply.content), reply.rest + bytes(rest) if is_switch else b""
 
 
 def run_websocket(data: bytes) -> None:

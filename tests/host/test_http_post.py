@@ -83,3 +83,15 @@ def test_a_server_without_tls_and_a_missing_ca_file_are_problems() -> None:
             HttpPost(
                 PostUrl("127.0.0.1", url.port, True, "/w"), PostAccess(None, "/absent.pem"), VirtualClock().now_ns
             ).post(BODY)
+
+
+def test_another_protocol_is_an_error() -> None:
+    """imud requests no other protocol."""
+    with fake_database() as database:
+        database.replies = [(101, "")]
+        delivery = post(database, PostAccess())
+        with pytest.raises(OSError, match="the server replied 101"):
+            delivery.post(BODY)
+        delivery.post(BODY)
+        delivery.close()
+        assert len(database.connections) == 2

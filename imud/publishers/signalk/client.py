@@ -14,15 +14,16 @@ from typing import Final, NamedTuple
 import msgspec
 
 from imud.contracts.publisher import PublisherClock
+from imud.host.http_reply import SWITCHING_PROTOCOLS, HttpReply, InvalidReply
 from imud.host.network import certificates_of, tls_context
 from imud.host.peer_stream import PeerStream, open_peer_stream
 from imud.host.threads import call_in_thread
 from imud.model.work_budget import WorkBudget, WorkLimits
-from imud.publishers.signalk.http_reply import SWITCHING_PROTOCOLS, InvalidReply, ReplyParser
 from imud.publishers.signalk.settings import ServerAddress
 from imud.publishers.signalk.websocket import REPLY_S, UnusableServer, WebSocket, accept_of, new_key
 
-REPLY_BYTES_MAX: Final = 65_536  # maximum size of a reply, bytes. Values of one path with 100 sources need 20 kB.
+# Maximum size of the content of a reply, bytes. Values of one path with 100 sources need 20 kB.
+CONTENT_BYTES_MAX: Final = 65_536
 # OpenSSL rejects certificates with these codes because of the date: not yet valid, expired.
 DATE_CODES: Final = (9, 10)
 # Key of 1024 bits, as in certificates of older Signal K servers. imud accepts such a key only if `ca_file` contains
@@ -87,7 +88,7 @@ class SignalKClient:
             finally:
                 stream.end_turn()
                 stream.abort()
-        return reply.status, bytes(reply.body)
+        return reply.status, bytes(reply.content)
 
     async def open_websocket(self, path: str, headers: Mapping[str, str]) -> WebSocket:
         """Open a WebSocket. Raises HandshakeRefused, and the errors of `request`."""
@@ -135,7 +136,7 @@ class SignalKClient:
 
     async def _exchange(
         self, stream: PeerStream, method: str, path: str, headers: Mapping[str, str], body: bytes
-    ) -> ReplyParser:
+    ) -> HttpReply:
         """Send a request and return the complete reply."""
         host = self._address.url.partition("://")[2]
         lines = [f"{method} {path} HTTP/1.1", f"Host: {host}", "User-Agent: imud", "Accept: application/json"]
@@ -143,7 +144,7 @@ class SignalKClient:
         if body:
             lines.append(f"Content-Length: {len(body)}")
         stream.write("\r\n".join((*lines, "", "")).encode("ascii") + body)
-        reply = ReplyParser(REPLY_BYTES_MAX)
+        reply = HttpReply(CONTENT_BYTES_MAX)
         try:
             while not reply.is_complete:
                 data = await stream.read()

@@ -112,7 +112,7 @@ def test_endless_replies_end_at_their_limit(reply: bytes) -> None:
         await writer.drain()
 
     async def scene(client: SignalKClient) -> None:
-        with pytest.raises(UnusableServer, match=r"expected .*at most \d+ bytes, got more; set signalk\.url"):
+        with pytest.raises(UnusableServer, match=r"expected .*at most .*, got more; set signalk\.url"):
             await client.request("GET", "/", {})
 
     Bench().run(serve, scene)
