@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import pytest
 
-from imud.contracts.command import Calibration, Kept, RestMeans, Target, Verdict
+from imud.contracts.command import Calibration, Kept, RestMeans, Target
 from imud.contracts.script import Outcome, Rejection, Reply, Request, RequestScript, Silence
 from imud.contracts.setting import combined
 from imud.drivers.hipnuc.common import AttitudeMode, LevelReset
@@ -579,15 +579,18 @@ def test_requests_of_a_calibration(kind: str, begun: list[str], saved: list[str]
 
 @pytest.mark.manual("B 8.1.1 result")
 def test_verdict_of_the_magnetometer() -> None:
-    for lines, verdict in (
-        (("MB=14.14, -2.08, -8.75", "OK"), Verdict(True, "bias 14.14, -2.08, -8.75 µT")),
-        (("MB=0.00, 0.00, 0.00", "OK"), Verdict(False, "bias 0, 0, 0 µT")),
-        (("MC=1", "OK"), Verdict(False, "the device does not report its bias")),
+    for lines, is_done, text, bias_ut in (
+        (("MB=14.14, -2.08, -8.75", "OK"), True, "bias 14.14, -2.08, -8.75 µT", (14.14, -2.08, -8.75)),
+        (("MB=0.00, 0.00, 0.00", "OK"), False, "bias 0, 0, 0 µT", (0.0, 0.0, 0.0)),
+        (("MC=1", "OK"), False, "the device does not report its bias", None),
     ):
         ask = CALIBRATIONS["magnetometer"].verdict
         assert ask is not None
-        (request,), found = asked(ask(TARGET), [Reply(lines)])
-        assert (request.payload, found) == (b"LOG MAGCONFIG\r\n", verdict)
+        (request,), verdict = asked(ask(TARGET), [Reply(lines)])
+        assert request.payload == b"LOG MAGCONFIG\r\n"
+        assert (verdict.done, verdict.words) == (is_done, text)
+        bias_t = None if bias_ut is None else pytest.approx(tuple(value * 1e-6 for value in bias_ut))
+        assert verdict.bias_t == bias_t
         with pytest.raises(NoReply, match="does the device have a magnetometer"):
             asked(ask(TARGET), [Silence(())])
         with pytest.raises(Rejected, match="LOG MAGCONFIG: the device rejected the request: ERR"):
