@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import pytest
 
-from imud.contracts.command import Calibration, Kept, RestMeans, Target
+from imud.contracts.command import Calibration, Kept, RestMeans, Target, Verdict
 from imud.contracts.script import Outcome, Rejection, Reply, Request, RequestScript, Silence
 from imud.contracts.setting import combined
 from imud.drivers.hipnuc.common import AttitudeMode, LevelReset
@@ -587,6 +587,7 @@ def test_verdict_of_the_magnetometer() -> None:
         ask = CALIBRATIONS["magnetometer"].verdict
         assert ask is not None
         (request,), verdict = asked(ask(TARGET), [Reply(lines)])
+        assert isinstance(verdict, Verdict)
         assert request.payload == b"LOG MAGCONFIG\r\n"
         assert (verdict.done, verdict.words) == (is_done, text)
         bias_t = None if bias_ut is None else pytest.approx(tuple(value * 1e-6 for value in bias_ut))
