@@ -69,7 +69,7 @@ def test_user_without_rights_cannot_take_leases(database: str) -> None:
 
 
 def test_lease_of_lost_session_is_free(database: str) -> None:
-    first, second = LeaseHolder(database), LeaseHolder(database)
+    first, second = LeaseHolder(database, 3600), LeaseHolder(database, 3600)  # no lease ends by its time
     with closing(first), closing(second):
         first.connect()
         second.connect()
