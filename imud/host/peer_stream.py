@@ -73,7 +73,9 @@ class PeerStream:
 
     def abort(self) -> None:
         """Close the connection immediately. A second call does nothing."""
-        self._writer.transport.abort()
+        # a transport that has sent its last bytes after `close` has no event loop any longer, and `abort` fails
+        with suppress(AttributeError):
+            self._writer.transport.abort()
 
     async def close(self) -> None:
         """Send the queued bytes for at most CLOSE_S, and close the connection."""

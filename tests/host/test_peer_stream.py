@@ -111,3 +111,22 @@ async def test_first_address_that_accepts(monkeypatch: pytest.MonkeyPatch) -> No
     addresses.return_value = ["127.0.0.2", "127.0.0.3"]
     with pytest.raises(ConnectionRefusedError):
         await open_peer_stream("name", 9, "the server", WorkBudget(WorkLimits(), Cpu()), lambda: 0)
+
+
+@in_loop
+async def test_close_sends_the_queued_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The transport closes itself after the last byte. A second call of `abort` does nothing."""
+    received_bytes = 0
+
+    async def serve(reader: asyncio.StreamReader, _writer: asyncio.StreamWriter) -> None:
+        nonlocal received_bytes
+        while data := await reader.read(1 << 20):
+            received_bytes += len(data)
+
+    monkeypatch.setattr(peer_stream, "CLOSE_S", 60.0)
+    async with connected(serve, Cpu()) as (stream, _):
+        stream.write(bytes(30_000_000))
+        await stream.close()
+        stream.abort()
+        stream.abort()
+    assert received_bytes == 30_000_000

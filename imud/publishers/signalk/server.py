@@ -230,7 +230,12 @@ class SignalKServer:
         """Send the queued deltas. Wait while the server does not read."""
         while True:
             while self._queue:
-                await websocket.send(self._queue.popleft())
+                delta = self._queue.popleft()
+                try:
+                    await websocket.send(delta)
+                except BaseException:
+                    self._dropped += 1
+                    raise
                 self._sent += 1
             self._has_more.clear()
             await self._has_more.wait()
