@@ -123,14 +123,14 @@ WRONG_EVENTS: list[Any] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("events", EVENTS, ids=str)
+@pytest.mark.parametrize("events", EVENTS, ids=map(str, range(len(EVENTS))))
 def test_valid_events_pass(events: Any) -> None:
     codec = guarded("stream")
     codec.codec.result = events
     assert codec.feed(b"abc") == list(events)
 
 
-@pytest.mark.parametrize("events", WRONG_EVENTS, ids=str)
+@pytest.mark.parametrize("events", WRONG_EVENTS, ids=map(str, range(len(WRONG_EVENTS))))
 def test_wrong_events_fail(events: Any) -> None:
     codec = guarded("stream")
     codec.codec.result = events

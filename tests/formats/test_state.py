@@ -104,7 +104,7 @@ def test_containers_of_the_new_object_are_kept() -> None:
         (Map(BYTE, BYTE, 1), [[1, 1], [2, 2]], {}), (Map(BYTE, BYTE, 1), {1: 1}, {}), (Row(BYTE), [1, 2], None),
         (Row(BYTE), 1, None), (SameAs("other"), 0, None), (SameAs("other"), 1, None),
     ],
-    ids=repr,
+    ids=lambda value: type(value).__name__,
 )  # fmt: skip
 def test_invalid_values_are_errors(kind: ValueType, saved: object, new: object) -> None:
     with pytest.raises(StateError, match="value: expected"):
