@@ -21,8 +21,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Final
 
-import msgspec
-
 log = logging.getLogger(__name__)
 
 # Maximum length of one value. The longest product string, of a USB descriptor, has 126 characters.
@@ -67,6 +65,8 @@ def printable_json(value: object) -> str:
 
     Texts of devices, adapters and other hosts can contain such characters. JSON permits them without an escape.
     """
+    import msgspec  # most commands print no JSON
+
     text: str = msgspec.json.encode(value).decode()
     if text.isprintable():
         return text

@@ -80,7 +80,7 @@ def test_problems_of_options_and_defaults_of_a_driver() -> None:
 def test_lines_have_the_documented_values_and_the_instant_of_the_measurement() -> None:
     """A frame starts 125 µs after a trigger and 80 µs after the start of the pulse."""
     assert {name: check_schema(f"Line `{name}`", schema) for name, schema in lines.LINE_SCHEMAS.items()} == {
-        "sout": 7, "sout_div": 1, "sin": 5, "alarm": 0, "reset": 4, "data_ready": 3, "pps": 1,
+        "sout": 7, "sout_div": 1, "sin": 5, "alarm": 0, "reset": 4, "data_ready": 3, "pps": 2,
     }  # fmt: skip
     with pytest.raises(ValueError, match=r"^expected the key chip next to the number of a line, got no chip$"):
         lines.SoutOptions(line=17)

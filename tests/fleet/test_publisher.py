@@ -372,11 +372,15 @@ def test_status_without_current_samples_has_no_values(tmp_path: Path) -> None:
     for _ in range(5):
         bench.tick()
     assert bench.asked == asked, "imud publishes the loss once"
+
+    def temperatures() -> list[float | None]:
+        messages = [message for connection in bench.broker.connections for message in connection.sent]
+        return [json.loads(payload)["temperature_c"] for name, payload, _ in messages if name == topic]
+
     bench.output.publish(Batch("imu0", 0, [sample("imu0", 2)]))
     bench.tick()
-    sent = bench.close()
-    values = [json.loads(payload)["temperature_c"] for name, payload, _ in sent if name == topic]
-    assert values == [21.5, None, 21.5]
+    bench.broker.wait_for(topic, lambda _payload: temperatures() == [21.5, None, 21.5])
+    bench.close()
 
 
 def test_missing_acknowledgement_is_a_problem(tmp_path: Path) -> None:

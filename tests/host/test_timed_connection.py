@@ -73,9 +73,9 @@ def test_endless_reply_ends_at_the_deadline(listener: socket.socket, data: bytes
     post = post_to(listener, clock)
     with pytest.raises(OSError, match=problem):
         post.post(b"imud_a f=1i 1\n")
-    assert clock.readings < 300
     for connection in accepted:
         connection.close()
+    assert clock.readings * step_s < REQUEST_S + 2 * step_s, "the wait for the name server reads the clock too"
 
 
 def test_tls_handshake_has_the_same_deadline(listener: socket.socket) -> None:
@@ -193,4 +193,4 @@ def test_closed_connection_cannot_send() -> None:
         connection.send(b"x")
     connection.stop()
     with pytest.raises(ExchangeStopped):
-        connection.open("localhost", 9)
+        connection.open("127.0.0.1", 9)
