@@ -195,7 +195,7 @@ class Device:
         has_settings = bool(settings.declared or settings.is_unsaved or settings.comparison.problem)
         axes, axes_problem = self._attitude.problem(transport.driver, settings, transport.axes_problem)
         t_err_ns, last_ns = 0, path.last_sample_ns if path is not None else 0
-        newest = path.newest if path is not None else None
+        newest_ns = path.clock.t_ns if path is not None and path.last_sample_ns else 0
         if path is not None and self.config.condition.t_err_ms is not None:
             t_err_ns = path.quality[1]
         self._judge.judge(now_ns, rate_hz, t_err_ns, last_ns, Known(
@@ -203,7 +203,7 @@ class Device:
             settings.status() if has_settings else None, axes, axes_problem, lines,
             path is not None and path.clock.has_scattered_time, utc_problem, ledger.bytes_open(), ledger.frames_open(),
             transport.is_in_boot_loader,
-        ), newest.t_ns if newest is not None else 0)  # fmt: skip
+        ), newest_ns)  # fmt: skip
 
     def _tick_flow(self, path: SamplePath, now_ns: int) -> None:
         """Flush an idle link, and detect silence and the first sample. Not necessary while recent samples arrive."""

@@ -46,8 +46,8 @@ def interface_problem(name: str) -> str:
     if is_valid and not any(character in "/:" or character.isspace() for character in name):
         return ""
     return (
-        f"expected the name of a network interface, at most {INTERFACE_BYTES_MAX} bytes without `/`, `:` and spaces, "
-        f"got {name}; `ip link` lists the interfaces"
+        f"expected the name of a network interface, at most {INTERFACE_BYTES_MAX} bytes without slash, colon and "
+        f"spaces, got {name}; the command ip link lists the interfaces"
     )
 
 
@@ -302,17 +302,24 @@ class _Excursions:
         if self._newest_ns is None or len(self._distances_ns) < EXCURSION_DISTANCES:
             return False
         rise_ns = log_ns - self._newest_ns
-        return rise_ns < -DISORDER_NS or rise_ns > max(self._distances_ns) + EXCURSION_NS
+        return rise_ns < -DISORDER_NS or self._is_unusual_rise(rise_ns)
+
+    def _is_unusual_rise(self, rise_ns: int) -> bool:
+        return rise_ns > max(self._distances_ns) + EXCURSION_NS
 
     def _is_return(self, log_ns: int) -> bool:
-        """Return whether a time continues the times before the held lines."""
+        """Return whether a time continues the times before the held lines, and has a step back to them.
+
+        After a short step of the clock to the past, the times reach the times before in their usual distances.
+        """
         if self._newest_ns is None:
             return False
         limit_ns = 2 * (len(self._held) + 1) * max(self._distances_ns) + EXCURSION_NS
         is_near = -DISORDER_NS <= log_ns - self._newest_ns <= limit_ns
         is_ahead = self._held[0].log_ns > self._newest_ns
         step_ns = log_ns - self._held[-1].log_ns
-        return is_near and (step_ns < -DISORDER_NS if is_ahead else step_ns > DISORDER_NS)
+        has_step_back = step_ns < -DISORDER_NS if is_ahead else self._is_unusual_rise(step_ns)
+        return is_near and has_step_back
 
     def _corrected(self, return_ns: int) -> Iterator[LogLine]:
         """Yield the held lines in the middle between the times before and after them."""

@@ -55,7 +55,8 @@ def test_calibrations_are_listed_verified_and_saved(daemon: RunningDaemon, cli: 
 def test_mistakes_are_explained(daemon: RunningDaemon, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     words = ("calibrate", "--socket", daemon.socket, "bow")
     cli.refuses("unknown calibration 'dance'; bow has: magnetometer, ", *words, "dance", "--yes")
-    cli.refuses("cannot save: the result lasts until power-off", *words, "heading", "--yes", "--save")
+    refusal = "the device cannot save the result, which lasts until power-off; repeat the command without --save"
+    cli.refuses(refusal, *words, "heading", "--yes", "--save")
     cli.refuses("expected 9-axis mode", *words, "magnetometer", "--yes")
     cli.refuses("cannot ask for confirmation without a terminal; confirm with --yes", *words, "level")
     turn = "Start to turn the device, then press Enter to start"

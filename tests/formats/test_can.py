@@ -194,3 +194,19 @@ def test_pause_is_kept(rise_s: float) -> None:
     frames = _log(lambda sample: rise_s * (sample >= 100))
     span_ns = frames[-1].t_rx_ns - frames[0].t_rx_ns
     assert span_ns == round((2.99 + 0.0009 + rise_s) * NS_PER_S)
+
+
+@pytest.mark.parametrize("step_s", [-0.015, -0.05, -0.07, -6.0])
+def test_step_to_the_past_is_no_excursion(step_s: float) -> None:
+    """After a short step, the times soon reach the times before, but without a step back."""
+    lines = [
+        f"({1000 + sample * 0.01 + step_s * (sample >= 100) + place * 0.0003:.6f}) can0 1{place:02X}#00"
+        for sample in range(300)
+        for place in range(4)
+    ]
+    reader = can.CandumpReader(io.BytesIO("\n".join(lines).encode()))
+    frames = list(reader)
+    fall_s = step_s + 0.01 - 3 * 0.0003
+    assert reader.problem.startswith(f"line 401: the time changes by {fall_s:+.3f} s (a step of the clock")
+    assert [frame.after_loss for frame in frames].count(True) == 1
+    assert abs(frames[-1].t_rx_ns - frames[0].t_rx_ns - round(2.9909 * NS_PER_S)) <= 10 * NS_PER_MS

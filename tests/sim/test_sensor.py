@@ -110,7 +110,7 @@ VARIANTS_OF: dict[str, Any] = {
     "hipnuc-canopen": canopen.NODE_VARIANTS, "hipnuc-j1939": j1939.J1939_VARIANTS, "imu61x-uart": uart.VARIANTS,
 }  # fmt: skip
 REPLIES = {
-    "hipnuc-uart": 0xA44BBCBC, "hipnuc-modbus": 0xC5960473, "hipnuc-canopen": 0x2945F911, "hipnuc-j1939": 0xB2E17DA8,
+    "hipnuc-uart": 0xF48E8C64, "hipnuc-modbus": 0xC5960473, "hipnuc-canopen": 0x2945F911, "hipnuc-j1939": 0xB2E17DA8,
     "hipnuc-nmea2000": 0x56276182, "imu61x-uart": 0x1D54A669, "imu61x-can": 0x1A1332E7,
 }  # fmt: skip
 

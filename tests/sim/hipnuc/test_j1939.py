@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from imud.contracts.command import Target
+from imud.contracts.command import Target, VerbResult
 from imud.contracts.script import Outcome, Rejection, Reply, ReplyFrame, Request, RequestScript, Silence
 from imud.contracts.setting import combined
 from imud.drivers.hipnuc.j1939 import codec, commands
@@ -72,9 +72,11 @@ class J1939Host:
         codec = HipnucJ1939Codec(Ledger(), HipnucJ1939Options(address=address, host_address=self.host))
 
         def ask(request: Request) -> Outcome:
-            can_id, size, data = RAW_FRAME.unpack(request.payload)
-            self.module.receive(can_id & EXTENDED_ID_MAX, True, data[:size], self.now_ns)
-            frames = self.wait(5 * MS)
+            if request.payload:
+                can_id, size, data = RAW_FRAME.unpack(request.payload)
+                self.module.receive(can_id & EXTENDED_ID_MAX, True, data[:size], self.now_ns)
+            # a request without a payload only listens, for its complete time
+            frames = self.wait(5 * MS if request.payload else request.timeout_ns)
             events = [e for f in frames for e in codec.feed_frame(f.can_id, f.extended, f.data, f.due_ns)]
             also = [f for f in frames if any(wanted.matches(f.can_id, f.extended) for wanted in request.also)]
             messages = [e for e in events if isinstance(e, ReplyFrame)] + [ReplyFrame(f.can_id, f.data) for f in also]
@@ -258,9 +260,14 @@ def test_registers_replies_and_a_single_message() -> None:
     replies = [f for f in bench.heard if split(f.can_id).pgn == codec.CONFIGURE]
     assert {split(f.can_id).destination for f in replies} == {0x55}
     bench = J1939Host(made())
-    bench.talk(lambda peer: commands.send_once(peer, 0xFF46))
+    result = bench.talk(lambda peer: commands.send_once(peer, 0xFF46))
+    assert isinstance(result, VerbResult)
+    assert result.verified
     assert pgns(bench.heard)[0xFF46] == 1
     assert pgns(bench.wait(SECOND_NS))[0xFF46] == 0
+    result = bench.talk(lambda peer: commands.send_once(peer, 0xFF34))
+    assert isinstance(result, VerbResult)
+    assert not result.verified  # FF34 also arrives without the request
 
 
 @pytest.mark.manual("B 6.2.2 zero", "B 6.2.2 directions")
