@@ -16,6 +16,7 @@ MINUTE_NS: Final = 60 * NS_PER_S
 HOUR_NS: Final = 60 * MINUTE_NS
 CAUSES: Final = tuple(name.removeprefix("lost_") for name in LOST_FIELDS)
 RATE_WINDOW_NS: Final = 10 * NS_PER_S  # time over which imud measures the rate, ns
+RATE_SECONDS: Final = RATE_WINDOW_NS // NS_PER_S + 1  # minimum number of counts in this time: one per second
 SHORT_NS: Final = 2 * NS_PER_S  # time of the rate in the status, ns: two samples of a device at 1 Hz
 STEADY: Final = 0.01  # maximum change of the expected rate within the window of a rate, as a share
 COUNTS_MAX: Final = 64  # maximum number of stored counts: one per second for a minute
@@ -133,6 +134,14 @@ class RecentCounts:
         span_ns = last.now_ns - first.now_ns
         return (last.samples - first.samples) * NS_PER_S / span_ns if span_ns > 0 else 0.0
 
+    def _count_before(self, time_ns: int) -> _Count | None:
+        """Return the newest count that is not after a time; None without such a count."""
+        counts = self._counts
+        index = len(counts) - RATE_SECONDS
+        while index >= 0 and counts[index].now_ns > time_ns:
+            index -= 1
+        return counts[index] if index >= 0 else None
+
     def steady_rate_hz(self) -> float | None:
         """Return the rate of received and lost samples by their time stamps.
 
@@ -141,8 +150,7 @@ class RecentCounts:
         last = self._counts[-1]
         if not self._steady_hz or not self._timed or last.now_ns - self._steady_ns < RATE_WINDOW_NS:
             return None
-        start_ns = last.now_ns - RATE_WINDOW_NS
-        first = next((count for count in reversed(self._counts) if count.now_ns <= start_ns), None)
+        first = self._count_before(last.now_ns - RATE_WINDOW_NS)
         if first is None or first.now_ns < self._steady_ns:
             return None
         span_ns = last.newest_ns - first.newest_ns
