@@ -54,6 +54,10 @@ PIPE_ENDS: Final = ("pipe_abort_read_r", "pipe_abort_read_w", "pipe_abort_write_
 class DescriptorPort(serial.Serial):
     """A port without the pipes of pyserial: one descriptor instead of five."""
 
+    # values of a port that pyserial could not construct: the interpreter closes such a port too
+    fd: int | None = None
+    is_open: bool = False
+
     def open(self) -> None:
         """Open the port. Raises OSError, ValueError or termios.error."""
         super().open()
