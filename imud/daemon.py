@@ -234,7 +234,7 @@ class Daemon:
 
     # --- life ------------------------------------------------------------------------------------------------------
 
-    async def run(self, on_stopping: "Callable[[BaseException | None], None]" = lambda _error: None) -> None:
+    async def run(self, on_stopping: Callable[[BaseException | None], None] = lambda _error: None) -> None:
         """Run until `stop`. Call `on_stopping` with the error, or None, before imud closes the devices and outputs.
 
         Raises ServerError if a required output cannot start, and the error that ended the task of a device.
@@ -491,14 +491,17 @@ class Daemon:
         self._stop.clear()
         log.warning(
             "imud stops after the firmware update of %s, at most %g s; a second stop interrupts the update",
-            ", ".join(names), STOP_LIMIT_S,
-        )  # fmt: skip
+            ", ".join(names),
+            STOP_LIMIT_S,
+        )
+
         second_stop: asyncio.Future[Any] = asyncio.ensure_future(self._stop.wait())
         waits = [updates[name].wait_for_end(STOP_LIMIT_S) for name in names]
         ends: asyncio.Future[Any] = asyncio.gather(*waits)
         await asyncio.wait({second_stop, ends}, return_when=asyncio.FIRST_COMPLETED)
         second_stop.cancel()
         ends.cancel()
+
         for name in names:
             if not updates[name].is_interruptible:
                 log.error("%s: imud stops during the firmware update; start imud and repeat the update", name)
